@@ -1,1 +1,1 @@
-"""Content sources, each of which draws a scene as one eye sees it, on a given grid of pixels."""
+"""Content sources. Each draws a scene as seen by one eye, on a given pixel grid."""

@@ -1,6 +1,6 @@
-"""Interface of content sources, which draw a scene as one eye sees it, on a given grid of pixels.
+"""Interface for content sources, which draw a scene as seen by one eye on a given pixel grid.
 
-`ContentSource` is also the base class of user-defined scenes, such as `scene = "mypackage.tunnel:Tunnel"`. A scene
+`ContentSource` is also the base class for user-defined scenes, such as `scene = "mypackage.tunnel:Tunnel"`. A scene
 only has to implement `render`. The other methods are optimisations, and their defaults are correct for any scene.
 """
 
@@ -27,7 +27,7 @@ WHITE: Colour = (1.0, 1.0, 1.0)
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """An eye and the raster on which to draw the eye's picture."""
+    """An eye, and the raster to draw its picture on."""
 
     eye_m: F64  # (3,) position in frame `stack`
     side: int  # 0 is the left eye, 1 the right eye
@@ -40,14 +40,14 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class ContentInfo:
-    """Static properties of a scene, from which the solver derives the work that it can skip."""
+    """Static properties of a scene. The solver uses them to decide which work it can skip."""
 
     name: str
     moving: bool = False
     grey: bool = False
     background: Colour | None = WHITE  # uniform colour behind the scene, or None if the background is not uniform
     flat_x_m: float | None = None  # x coordinate of the plane that contains the whole scene, or None if not flat
-    left_out: tuple[str, ...] = ()  # features of the file that are not drawn
+    left_out: tuple[str, ...] = ()  # features in the file that are not drawn
 
 
 class ContentSource(ABC):
@@ -58,14 +58,14 @@ class ContentSource(ABC):
 
     Options: ClassVar[type[BaseModel]] = Section  # model that validates [content.options] for a user-defined scene
     info: ContentInfo
-    draws_in: object = None  # GL context that owns the textures from `draw`, or None if the source returns arrays
+    draws_in: object = None  # GL context that owns the textures `draw` returns, or None if the source returns arrays
 
     def __init__(self, options: Any, *, stack: Any, context: Any) -> None:
         """Create a user-defined scene.
 
         Args:
             options: Instance of `Options`.
-            stack: Panels of the display (`PanelStack`).
+            stack: The display's panels (`PanelStack`).
             context: Current moderngl context.
 
         Raises:
@@ -78,11 +78,11 @@ class ContentSource(ABC):
         """Return the eye's picture on the view's raster as an RGBA array (height_px, width_px, 4).
 
         Row 0 is at the top. Colours are already blended with the background. Alpha is the content's coverage and is 0
-        only where nothing but the background is visible. The array belongs to the source and stays valid until the next
-        call of `render` for the same side.
+        only where nothing but the background is visible. The array belongs to the source and stays valid until `render`
+        is next called for the same side.
 
         Args:
-            view: Eye and raster to draw for.
+            view: Eye to draw for, and raster to draw on.
             time_ns: Time on the run's clock, which determines the state of moving content.
 
         Raises:
@@ -90,7 +90,7 @@ class ContentSource(ABC):
         """
 
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture | None:
-        """Return the picture as a texture, or None if the caller has to use `render`.
+        """Return the picture as a texture, or None if the caller must use `render` instead.
 
         The texture stays valid until the source draws the next picture for the same side. Raises ContentFailure if the
         picture cannot be drawn at the moment.
@@ -98,19 +98,20 @@ class ContentSource(ABC):
         return None
 
     def nearness(self, view: View, *, every: int, first: tuple[int, int]) -> F32 | None:
-        """Return the inverse distance of the nearest point in each block of pixels, in 1/m.
+        """Return the inverse distance to the nearest point in each block of pixels, in 1/m.
 
-        The blocks divide the newest picture that was drawn for the view's side. Distances are measured along the third
+        The latest picture drawn for the view's side is divided into blocks. Distances are measured along the third
         coordinate of the view's projection.
 
         Args:
-            view: View for which the newest picture was drawn.
-            every: Side of a square block, in pixels.
-            first: Columns and rows, less than `every`, that the first block lacks at its left and its top.
+            view: View that the latest picture was drawn for.
+            every: Side length of the square blocks, in pixels.
+            first: Numbers of columns and rows, less than `every`, that are missing from the first block at its left and
+                top.
 
         Returns:
-            Array (h, w) with one value per block, which is 0 where only the background is visible. The result is None
-            if distances are unknown. Content is then aligned to new eye positions as if it were on the middle panel.
+            An (h, w) array with one value per block: 0 where only the background is visible. None if the distances are
+            unknown. In that case, content is aligned to new eye positions as if it were on the middle panel.
         """
         return None
 
@@ -124,12 +125,13 @@ class ContentSource(ABC):
     def program(self) -> dict[str, Any] | None:
         """Status of the program that draws the scene, or None if the source draws the scene itself.
 
-        The keys are `address`, to which the program connects, and `frame_ms`, the duration of a recent frame.
+        The keys are `address`, the address that the program connects to, and `frame_ms`, the time that a recent frame
+        took.
         """
         return None
 
     def extent(self, view: View, *, time_ns: int) -> PixelRect | None:
-        """Return a box of pixels outside which only the background is visible, or None if unknown."""
+        """Return a pixel box that contains everything visible except the background, or None if unknown."""
         return None
 
     def revision(self, *, time_ns: int) -> int:
@@ -137,34 +139,34 @@ class ContentSource(ABC):
         return time_ns if self.info.moving else 0
 
     def describe(self, *, time_ns: int) -> dict[str, Any] | None:
-        """Return the entries and current position of a playlist, or None if the source is not a playlist."""
+        """Return a playlist's entries and current position, or None if the source is not a playlist."""
         return None
 
     def skip(self, *, time_ns: int) -> bool:
-        """Skip to the next entry of a playlist. Return False if no entry follows."""
+        """Skip to a playlist's next entry. Returns False if no entry follows."""
         return False
 
     @property
     def problem(self) -> str:
-        """Description of the current fault in one line, or an empty string if the source works.
+        """One-line description of the current fault, or an empty string if the source is working.
 
         The last good picture stays on the display until the fault is resolved.
         """
         return ""
 
     def close(self) -> None:  # noqa: B027 - most sources hold nothing
-        """Release GL objects and files. The method may be called more than once."""
+        """Release GL objects and files. May be called more than once."""
 
 
 class ForwardingSource(ContentSource):
-    """Source that forwards every request to another source, which the subclass chooses."""
+    """Source that forwards every request to another source, chosen by the subclass."""
 
-    source: ContentSource  # source that is currently shown
-    _drew: tuple[ContentSource | None, ContentSource | None] = (None, None)  # source of each side's newest picture
+    source: ContentSource  # source currently shown
+    _drew: tuple[ContentSource | None, ContentSource | None] = (None, None)  # source of each side's latest picture
 
     @abstractmethod
     def forwarded(self, view: View, time_ns: int) -> tuple[ContentSource, View, int]:
-        """Return the source that serves a request, and the view and the time to pass to this source."""
+        """Return the source that serves a request, and the view and time to pass to it."""
 
     @property
     def problem(self) -> str:

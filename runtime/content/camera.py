@@ -1,4 +1,4 @@
-"""Convert the 3x4 projection of a view to an OpenGL clip matrix, and project points and boxes."""
+"""Convert a view's 3x4 projection to an OpenGL clip matrix, and project points and boxes."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from runtime.content.base import View
 from runtime.optics.rect import PixelRect
 from runtime.records import F64
 
-NEAREST_M = 1e-3  # distance of the near plane from the eye
+NEAREST_M = 1e-3  # distance from the eye to the near plane
 
 
 def clip_from_stack(view: View, corners_m: F64) -> F64:
-    """Return the 4x4 OpenGL clip matrix of a view.
+    """Return the 4x4 OpenGL clip matrix for a view.
 
-    The raster's v axis runs along +y in OpenGL, which stores the lowest row first. Row 0 of the raster is then row 0
-    of the pixels that are read back, and the picture need not be flipped.
+    The raster's v axis is mapped to +y in OpenGL, which stores the bottom row first. Row 0 of the raster is therefore
+    also row 0 of the pixels read back, and the picture need not be flipped.
 
     Args:
-        view: View whose projection is converted.
-        corners_m: Corners (8n, 3) of n boxes in frame `stack`, which the near and far planes enclose.
+        view: View whose projection to convert.
+        corners_m: Corners (8n, 3) of n boxes in frame `stack`. The near and far planes are chosen to enclose them.
 
     Raises:
         ValueError: No corner is in front of the eye.
@@ -35,7 +35,7 @@ def clip_from_stack(view: View, corners_m: F64) -> F64:
 
 
 def box_corners(low_m: ArrayLike, high_m: ArrayLike) -> F64:
-    """Return the (8, 3) corners of an axis-aligned box."""
+    """Return the eight corners of an axis-aligned box as an (8, 3) array."""
     bounds = np.array([low_m, high_m], dtype=np.float64)
     return np.array([[bounds[i, 0], bounds[j, 1], bounds[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
 
@@ -43,7 +43,7 @@ def box_corners(low_m: ArrayLike, high_m: ArrayLike) -> F64:
 def project(pixels_from_stack: F64, points_m: F64) -> tuple[F64, F64]:
     """Project points (n, 3) in frame `stack` to pixels (n, 2) and depths (n,) in metres.
 
-    The pixel coordinates of points behind the eye are undefined.
+    Pixel coordinates are undefined for points behind the eye.
     """
     homogeneous = points_m @ pixels_from_stack[:, :3].T + pixels_from_stack[:, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -51,14 +51,14 @@ def project(pixels_from_stack: F64, points_m: F64) -> tuple[F64, F64]:
 
 
 def covered_box(view: View, corners_m: F64, *, align_px: int = 32) -> PixelRect:
-    """Return a box of pixels that contains the projection of the convex hull of the given points.
+    """Return a pixel box that contains the projected convex hull of the given points.
 
     The box is empty if all points are behind the eye, and covers the whole raster if some of them are.
 
     Args:
-        view: View to whose raster the box is clipped.
+        view: View that the points are projected into. The box is clipped to its raster.
         corners_m: Points (n, 3) in frame `stack`.
-        align_px: The box is enlarged to multiples of this number of pixels.
+        align_px: Enlarge the box to multiples of this number of pixels.
     """
     pixels, depths = project(view.pixels_from_stack, corners_m)
     if depth_bounds(view, corners_m)[1] <= 2 * NEAREST_M:
@@ -74,7 +74,7 @@ def covered_box(view: View, corners_m: F64, *, align_px: int = 32) -> PixelRect:
 
 
 def depth_bounds(view: View, corners_m: F64) -> tuple[float, float]:
-    """Return near and far distances in metres that enclose all corners in front of the eye with a margin."""
+    """Return near and far distances in metres that leave a margin around all corners in front of the eye."""
     depths = project(view.pixels_from_stack, corners_m)[1]
     far = float(depths.max()) * 1.001 + NEAREST_M
     return max(float(depths.min()) * 0.999 - NEAREST_M, min(NEAREST_M, far / 2)), far

@@ -1,4 +1,4 @@
-"""Offscreen RGBA8 framebuffers with antialiasing for sources that draw with OpenGL."""
+"""Antialiased offscreen RGBA8 framebuffers for sources that draw with OpenGL."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ OVER = (moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA, moderngl.ONE, moderngl
 @dataclass(slots=True)
 class _Target:
     smooth: Any  # multisampled or half-float framebuffer, or None if the plain ones suffice
-    plain: list[Any]  # RGBA8 framebuffers, one for each side
-    pictures: list[U8]  # arrays (h, w, 4), one for each side, into which pixels are read back
+    plain: list[Any]  # RGBA8 framebuffers, one per side
+    pictures: list[U8]  # arrays (h, w, 4) that pixels are read back into, one per side
 
 
 class _Reducer:
@@ -81,15 +81,15 @@ class _Reducer:
         at_near: float,
         at_far: float,
     ) -> F32:
-        """Return an array (rows, columns) of values that vary linearly with the least depth in each block.
+        """Return a (rows, columns) array of values that vary linearly with the smallest depth in each block.
 
         Args:
             depth: Depth texture.
             size: Number of blocks (columns, rows).
-            every: Side of a square block, in pixels.
-            first: Columns and rows of pixels that the first block lacks at its left and its top.
+            every: Side length of the square blocks, in pixels.
+            first: Numbers of pixel columns and rows that are missing from the first block at its left and top.
             at_near: Value for depth 0.
-            at_far: Value for depth 1. Blocks in which nothing was drawn have the value 0 instead.
+            at_far: Value for depth 1. If nothing was drawn in a block, its value is 0 instead.
         """
         if size not in self._targets:
             if len(self._targets) >= SIZES_KEPT:
@@ -122,10 +122,10 @@ class _Reducer:
 
 
 class CanvasSource(ContentSource):
-    """Base class of sources that draw with OpenGL into one framebuffer for each size of view.
+    """Base class for sources that draw with OpenGL into one framebuffer per view size.
 
-    Only the box that the content may cover is drawn and resolved from multiple samples, because resolving is the most
-    expensive step on a software rasteriser. Pixels are read back only on request.
+    Only the box that the content may cover is drawn and has its multiple samples resolved, because resolving is the
+    most expensive step on a software rasteriser. Pixels are read back only on request.
     """
 
     def __init__(self, context: Any, *, info: ContentInfo, samples: int = 0, deep: bool = False) -> None:
@@ -133,13 +133,13 @@ class CanvasSource(ContentSource):
 
         Args:
             context: Current moderngl context.
-            info: Properties of the scene.
+            info: Scene properties.
             samples: Number of samples per pixel, or 0 for no multisampling.
-            deep: Draw in half floats, to blend many layers of which some are brighter than white.
+            deep: Draw in half floats, for blending many layers when some are brighter than white.
         """
         self.info, self.context = info, context
         self.draws_in = context
-        self.held: list[Any] = []  # GL objects that are released together with the source
+        self.held: list[Any] = []  # GL objects released together with the source
         self._deep = deep
         self._samples = min(samples, context.max_samples)
         self._clear_colour = (*(info.background or WHITE), 0.0)
@@ -154,7 +154,7 @@ class CanvasSource(ContentSource):
         return self.draw(view, time_ns=time_ns).pixels()
 
     def drawn(self, view: View, box: PixelRect, paint: Callable[[], None]) -> DrawnPicture:
-        """Clear the framebuffer of a view, call `paint` to draw inside `box`, and return the picture.
+        """Clear a view's framebuffer, call `paint` to draw inside `box`, and return the picture.
 
         The picture stays valid until another picture is drawn for the same side.
         """
@@ -190,7 +190,7 @@ class CanvasSource(ContentSource):
             self._reducer = _Reducer(self.context)
         size = -(-(view.width_px + first[0]) // every), -(-(view.height_px + first[1]) // every)
         depth = target.plain[view.side].depth_attachment
-        # A depth between the near and the far plane is linear in the inverse distance.
+        # Between the near and far planes, depth is linear in the inverse distance.
         return self._reducer.reduced(
             depth, size, every=every, first=first, at_near=1 / near_m, at_far=1 / far_m
         )  # fmt: skip
@@ -206,7 +206,7 @@ class CanvasSource(ContentSource):
 
     def _forget_oldest(self) -> None:
         target = self._targets.pop(next(iter(self._targets)))
-        # moderngl binds the current framebuffer again in later calls, so it must not be one that has been released.
+        # Later calls to moderngl bind the current framebuffer again, so it must not be one that has been released.
         self.context.detect_framebuffer(0).use()
         for framebuffer in (*target.plain, *([target.smooth] if target.smooth else [])):
             for attachment in (*framebuffer.color_attachments, framebuffer.depth_attachment):

@@ -22,12 +22,12 @@ from runtime.support.picture_header import decoded_picture
 from runtime.support.untrusted_input import LIMITS
 
 SPZ_HEADER = struct.Struct("<4sIIBBBBI12x")  # magic, version, count, degree, position bits, flags, streams, table
-SPZ_SHORT = 16  # size of the header in bytes, before version 4
-SPZ_COLOUR = 0.15  # scale of colours in SPZ, relative to coefficients of degree 0
-SOG_PARTS = {"means": 2, "scales": 1, "quats": 1, "sh0": 1}  # number of pictures for each property
-FIRST_TAG = 252  # alpha if a rotation's largest component has index 0; 253 to 255 stand for 1 to 3
-WIDE = 64  # number of palette entries in a row of `shN_centroids`
-MOST = max(COEFFICIENTS) // 3  # most coefficients above degree 0 per channel; those of degree 4 are not drawn
+SPZ_SHORT = 16  # header size in bytes before version 4
+SPZ_COLOUR = 0.15  # scale of SPZ colours relative to degree-0 coefficients
+SOG_PARTS = {"means": 2, "scales": 1, "quats": 1, "sh0": 1}  # number of pictures that store each property
+FIRST_TAG = 252  # alpha if a rotation's largest component is number 0; 253 to 255 stand for 1 to 3
+WIDE = 64  # palette entries per row of `shN_centroids`
+MOST = max(COEFFICIENTS) // 3  # largest number of coefficients above degree 0 per channel; degree 4 is not drawn
 U32 = NDArray[np.uint32]
 
 
@@ -37,9 +37,10 @@ def is_sog_folder(folder: Path) -> bool:
 
 
 def load_compressed_splats(path: Path) -> Gaussians:
-    """Read an SPZ file, a SOG file or a folder that contains an unpacked SOG file.
+    """Read an SPZ file, a SOG file, or a folder with an unpacked SOG file.
 
-    Raises InputError if the file is damaged, exceeds a limit, has an unsupported version, or contains no visible splat.
+    Raises InputError if the file is damaged, exceeds a limit, has an unsupported version, or contains no visible
+    splats.
     """
     try:
         with np.errstate(all="ignore"):
@@ -54,7 +55,8 @@ def load_compressed_splats(path: Path) -> Gaussians:
 def _spz(path: Path) -> Gaussians:
     """Read an SPZ file.
 
-    The file stores the positions of all splats, followed by all opacities, colours, scales, rotations and harmonics.
+    The file stores the positions of all splats first, then all opacities, then all colours, scales, rotations and
+    harmonics.
     """
     data = untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)
     zipped = zlib.decompressobj(31) if data[:2] == b"\x1f\x8b" else None
@@ -86,12 +88,12 @@ def _spz(path: Path) -> Gaussians:
 
 
 def _zstd_blocks(data: bytes, table: int, sizes: list[int]) -> list[bytes]:
-    """Decompress the streams of an SPZ file of version 4. Empty streams may be missing from the file.
+    """Decompress a version 4 SPZ file's streams. Empty streams may be missing from the file.
 
     Args:
-        data: Contents of the file.
-        table: Offset of the table of stream sizes, in bytes.
-        sizes: Expected size of each stream in bytes. No stream is decompressed beyond its expected size.
+        data: The file's contents.
+        table: Byte offset of the table that lists the stream sizes.
+        sizes: Expected size of each stream, in bytes. No stream is decompressed beyond this size.
     """
     import zstandard
 
@@ -112,16 +114,16 @@ def _fixed(places: U8, bits: int) -> F32:
 
 
 def _three_bytes(turns: U8) -> F32:
-    """Decode quaternions (n, 4), ordered w, x, y, z, of which the bytes (n, 3) contain x, y and z."""
+    """Decode the x, y and z bytes (n, 3) of quaternions into quaternions (n, 4) in w, x, y, z order."""
     xyz = turns / np.float32(127.5) - 1
     return np.column_stack([np.sqrt(np.maximum(1 - (xyz**2).sum(1), 0)), xyz]).astype(np.float32)
 
 
 def _four_bytes(turns: U32) -> F32:
-    """Decode quaternions (n, 4), ordered w, x, y, z, from packed 32-bit words.
+    """Decode packed 32-bit words (n,) into quaternions (n, 4) in w, x, y, z order.
 
-    The two highest bits of a word are the index of the largest component, in the order x, y, z, w. The other three
-    components follow, each as a sign and a magnitude of 9 bits.
+    The top two bits of each word give the index of the largest component, in x, y, z, w order. The other three
+    components follow, each stored as a sign bit and a 9-bit magnitude.
     """
     share = fields_of(turns, (1, 9, 1, 9, 1, 9))
     three = (1 - 2 * share[:, ::2]) * share[:, 1::2] * np.float32(np.sqrt(0.5))
@@ -131,8 +133,8 @@ def _four_bytes(turns: U32) -> F32:
 def _sog(path: Path) -> Gaussians:
     """Read a SOG file or folder.
 
-    SOG stores the properties of splats in pictures that have one pixel for each splat. The bytes of a pixel are
-    fractions of a range or indices of a codebook.
+    SOG stores the splats' properties in pictures with one pixel per splat. A pixel's bytes are either fractions of a
+    range or indices into a codebook.
     """
     with _SogFiles(path) as files:
         meta = untrusted_input.parsed_json(files.read("meta.json"), source=path)
@@ -169,7 +171,7 @@ def _sog(path: Path) -> Gaussians:
 
 
 class _SogFiles:
-    """Reads the pictures and metadata of a SOG scene, which is a folder or a ZIP archive."""
+    """Reader for the pictures and metadata of a SOG scene, stored in a folder or a ZIP archive."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -198,7 +200,7 @@ class _SogFiles:
         return np.asarray(image.convert("RGBA"))
 
     def pixels(self, name: str, count: int) -> U8:
-        """Return the first `count` pixels (count, 4) of a picture. Raises InputError if there are fewer."""
+        """Return a picture's first `count` pixels (count, 4). Raises InputError if it has fewer."""
         pixels = self.picture(name).reshape(-1, 4)[:count]
         if len(pixels) < count:
             raise InputError(self._path, untrusted_input.shown(name), f"has {len(pixels)} of {count} pixels")

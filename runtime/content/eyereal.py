@@ -1,4 +1,4 @@
-"""Read folders of the EyeReal data set: pairs of pictures whose names contain the eyes' positions."""
+"""Read folders from the EyeReal data set: pairs of pictures with the eyes' positions in their names."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from runtime.support.picture_file import read_image
 
 NUMBER = r"(-?(?:\d+\.?\d*|\.\d+))"
 NAME = re.compile(rf"pair(\d+)_x{NUMBER}_y{NUMBER}_z{NUMBER}_([01]|left|right)\.(?:jpg|jpeg|png)$", re.IGNORECASE)
-KEPT = 4  # number of pairs that are kept in memory
+KEPT = 4  # number of pairs kept in memory
 
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """Pictures of a scene for the left and the right eye, in two files."""
+    """A scene's pictures for the left and right eyes, in two files."""
 
     number: int
     paths: tuple[Path, Path]  # left, right
-    eyes_m: F64  # (2, 3) positions of the left and right eye, frame `stack`
-    looks_at_m: F64  # (3,) scene's origin in frame `stack`, at which both eyes look; not always on the display
+    eyes_m: F64  # (2, 3) left and right eye positions, frame `stack`
+    looks_at_m: F64  # (3,) scene's origin in frame `stack`, where both eyes look; not always on the display
 
     def image_from_stack(self, side: int, *, width_px: int, height_px: int, fov_deg: float) -> F64:
-        """Return the (3, 4) projection from `stack` to pixels of the left (`side` 0) or right (1) picture."""
+        """Return the (3, 4) projection from `stack` to the left (`side` 0) or right (1) picture's pixels."""
         around_origin = np.eye(4)
         around_origin[:3, 3] = -self.looks_at_m
         eye = self.eyes_m[side] - self.looks_at_m
@@ -42,23 +42,23 @@ class Pair:
 
 
 def is_data_set(folder: Path) -> bool:
-    """Return True if a folder contains a picture that is named as in the data set."""
+    """Return True if a folder contains a picture named as in the data set."""
     return folder.is_dir() and any(NAME.match(path.name) for path in folder.iterdir())
 
 
 def read_folder(folder: Path, preset: str) -> tuple[Pair, ...]:
-    """Return all pairs of a folder, ordered by number.
+    """Return all pairs in a folder, ordered by number.
 
     File names contain the eyes' positions in the scene's digital units. These positions determine whether `_0` or `_1`
     is the left picture. The names `_left` and `_right` in newer data must agree with the positions.
 
     Args:
-        folder: Folder of the pictures.
-        preset: Name of the scene.
+        folder: Folder that contains the pictures.
+        preset: Scene name.
 
     Raises:
-        InputError: There is no pair, a pair is incomplete, an eye is behind the display, or the left and the right
-            picture cannot be told apart.
+        InputError: There are no pairs, a pair is incomplete, an eye is behind the display, or a pair's left and right
+            pictures cannot be told apart.
     """
     stack_from_scene: F64 = np.linalg.inv(drawn_scene_from_stack(preset)).astype(np.float64)
     files: dict[int, list[tuple[str, Path, F64]]] = {}
@@ -91,8 +91,8 @@ def read_folder(folder: Path, preset: str) -> tuple[Pair, ...]:
 def prepare(file: SceneFile) -> Callable[..., ContentSource]:
     """Read a folder of pairs, and return a function that creates the source.
 
-    The preset is the chosen one or, by default, the preset whose name occurs in the folder's name. Raises InputError if
-    no preset is known, or if the pairs cannot be read.
+    Uses the chosen preset or, by default, the preset whose name occurs in the folder's name. Raises InputError if there
+    is no such preset, or if the pairs cannot be read.
     """
     path, settings = file.path, file.settings
     name = file.preset or next((name for name in preset_names() if name in path.resolve().name), "")
@@ -101,12 +101,12 @@ def prepare(file: SceneFile) -> Callable[..., ContentSource]:
     pairs = read_folder(path, name)
     background = settings.background or WHITE
     make = partial(EyeRealSource, pairs, fov_deg=settings.fov_deg, background=background, name=name)
-    make()  # reports an unreadable picture now
+    make()  # raises now if a picture is unreadable
     return make
 
 
 class EyeRealSource(ContentSource):
-    """Source that shows the pair whose left eye is nearest to the viewer's.
+    """Source that shows the pair whose left eye is nearest to the viewer's left eye.
 
     The pictures are warped to the viewer's eyes as if they were on the plane x = 0, at the centre of the display.
     """

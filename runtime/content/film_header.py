@@ -1,7 +1,6 @@
-"""Read the arrangement of views that a film file declares.
+"""Read the view arrangement that a film file declares.
 
-MP4 files contain this declaration in the boxes `st3d` and `sv3d` or in XML, and Matroska files in the element
-StereoMode.
+MP4 files declare it in the boxes `st3d` and `sv3d` or in XML, and Matroska files in the StereoMode element.
 """
 
 from __future__ import annotations
@@ -14,23 +13,23 @@ from typing import IO
 
 from runtime.support import untrusted_input
 
-MOVIE_BYTES, HEAD_BYTES = 32 << 20, 1 << 20  # most bytes read from an MP4's `moov` box and a Matroska file
-BOXES_MAX = 10_000  # most top-level boxes that are read from an MP4 file
+MOVIE_BYTES, HEAD_BYTES = 32 << 20, 1 << 20  # most bytes read from an MP4's `moov` box and from a Matroska file
+BOXES_MAX = 10_000  # most top-level boxes read from an MP4 file
 ST3D = re.compile(rb"\0\0\0\x0dst3d.{4}([\1\2])", re.DOTALL)
-EQUI = re.compile(rb"\0\0\0\x1cequi.{12}(.{4})(.{4})", re.DOTALL)  # the groups are the crop on the left and right
+EQUI = re.compile(rb"\0\0\0\x1cequi.{12}(.{4})(.{4})", re.DOTALL)  # the groups are the crops on the left and right
 XML_STEREO = re.compile(rb"GSpherical:StereoMode>\s*(left-right|top-bottom)")
 XML_AROUND = re.compile(rb"GSpherical:Spherical>\s*true")
-MULTIVIEW = b"vexu"  # box in films that headsets and phones record
+MULTIVIEW = b"vexu"  # box found in films recorded by headsets and phones
 SEGMENT, TRACKS, TRACK, VIDEO, STEREO_MODE = 0x18538067, 0x1654AE6B, 0xAE, 0xE0, 0x53B8
 MODES = {1: "side-by-side", 3: "top-bottom", 10: "anaglyph", 11: "cross-eyed"}
 
 
 @dataclass(frozen=True, slots=True)
 class FilmHeader:
-    """Arrangement of views that a film file declares. Fields that are not declared are empty or 0."""
+    """The view arrangement declared by a film file. Fields it does not declare are empty or 0."""
 
     layout: str = ""  # in the syntax of `content.layout`
-    span_deg: int = 0  # longitude that equirectangular views cover
+    span_deg: int = 0  # longitude covered by equirectangular views
     left_out: str = ""  # description of a view that is declared but not supported
 
 
@@ -80,7 +79,7 @@ def _matroska(file: IO[bytes]) -> FilmHeader:
 
 
 def _elements(data: bytes, within: slice) -> Iterator[tuple[int, slice]]:
-    """Yield the number and the range of content of each Matroska element in a part of `data`."""
+    """Yield each Matroska element's number and content range within a part of `data`."""
     place, end = within.start, min(within.stop, len(data))
     while place < end:
         number_bytes = 9 - data[place].bit_length()

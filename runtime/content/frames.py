@@ -1,4 +1,4 @@
-"""Open stills, animations, folders of pictures and films as sequences of pictures with layouts."""
+"""Open stills, animations, picture folders and films as sequences of pictures with layouts."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ PICTURES = (
     ".avif", ".heic", ".heif", ".hif", ".ppm", ".pgm", ".tga",
 )  # fmt: skip
 NOT_READ = (*RAW, ".jxl", ".exr", ".hdr", ".psd", ".svg", ".jp2", *VIDEOS)  # skipped and logged if found in a folder
-TOLD = 3  # number of skipped files that the log names for a folder
-TELL_EVERY = 64  # number of pictures between two progress reports
+TOLD = 3  # number of skipped files per folder that are named in the log
+TELL_EVERY = 64  # number of pictures between progress reports
 VIDEO_FRAMES_MAX = 1e8  # most frames that a header may declare: five weeks at 30 frames per second
 VIDEO_PROPERTIES = (
     cv2.CAP_PROP_FRAME_COUNT,
@@ -44,9 +44,9 @@ VIDEO_PROPERTIES = (
 
 
 class Frames(ABC):
-    """Sequence of pictures that is played repeatedly.
+    """Sequence of pictures that is played in a loop.
 
-    A constructor raises InputError if the files cannot be shown. Pictures that cannot be decoded later raise
+    Constructors raise InputError if the files cannot be shown. If a picture cannot be decoded later on, `frame` raises
     ContentFailure.
     """
 
@@ -56,7 +56,7 @@ class Frames(ABC):
 
     @abstractmethod
     def frame(self, index: int) -> U8:
-        """Return a picture (h, w, 3) in RGB, which contains all views of the picture's layout.
+        """Return an RGB picture (h, w, 3) that contains all views of its layout.
 
         Raises ContentFailure if the picture cannot be decoded.
         """
@@ -65,15 +65,15 @@ class Frames(ABC):
         return self.layouts[min(index, len(self.layouts) - 1)]
 
     def at(self, time_ns: int) -> int:
-        """Return the index of the picture shown at a time."""
+        """Return the index of the picture shown at a given time."""
         return int(time_ns * self.rate_hz / NS_PER_S) % self.count
 
     def close(self) -> None:  # noqa: B027 - most sequences hold no files open
-        """Close files that are open."""
+        """Close any open files."""
 
 
 class PictureFiles(Frames):
-    """Sequence of still pictures, each of which is a file.
+    """Sequence of still pictures, one per file.
 
     If a file contains two views and both are shown, the views are joined side by side.
     """
@@ -82,10 +82,10 @@ class PictureFiles(Frames):
         """Read the headers of all pictures, and decode the first picture.
 
         Args:
-            paths: Files of the pictures, in order.
-            settings: Settings of the content.
-            folder: Folder that contains the pictures, or None for a single file. Films in a folder and files whose
-                headers cannot be read are skipped and logged.
+            paths: Picture files, in order.
+            settings: Content settings.
+            folder: Folder that contains the pictures, or None for a single file. Films in a folder, and files with
+                headers that cannot be read, are skipped and logged.
 
         Raises:
             InputError: No file can be used, or the first picture cannot be decoded.
@@ -130,7 +130,7 @@ class PictureFiles(Frames):
 
 
 class Animation(Frames):
-    """Sequence of the frames of an animated picture, all of which are decoded at the start."""
+    """The frames of an animated picture, all decoded at the start."""
 
     def __init__(self, path: Path, settings: ContentSettings) -> None:
         self.layouts = [layout_of(path, settings)]
@@ -147,7 +147,7 @@ class Animation(Frames):
 
 
 class Video(Frames):
-    """Sequence of the frames of a video file, which OpenCV decodes during playback."""
+    """The frames of a video file, decoded by OpenCV during playback."""
 
     def __init__(self, path: Path, layout: Layout) -> None:
         self._path, self.layouts = path, [layout]
@@ -194,10 +194,10 @@ class Video(Frames):
 
 
 def layout_in(header: Header, path: Path, settings: ContentSettings, folder: Path | None = None) -> Layout:
-    """Return the layout of a picture.
+    """Return a picture's layout.
 
-    The layout of a file that contains two views is side by side, unless the settings request a single view or the
-    cross-eyed order. The layout of other files follows from the settings, the header, or the name of the file or of
+    If a file contains two views, its layout is side by side, unless the settings request a single view or the
+    cross-eyed order. Otherwise, the layout follows from the settings, the header, or the name of the file or of
     `folder`.
     """
     layout = layout_of(path, settings, stated=header.layout)
@@ -213,7 +213,7 @@ def layout_in(header: Header, path: Path, settings: ContentSettings, folder: Pat
 def open_frames(path: Path, settings: ContentSettings) -> Frames:
     """Open a picture, an animation, a video or a folder of pictures.
 
-    Raises InputError if the file cannot be shown, or if the folder contains no picture that can be shown.
+    Raises InputError if the file cannot be shown, or if the folder contains no pictures that can.
     """
     if not path.is_dir():
         if path.suffix.lower() in VIDEOS:
@@ -226,7 +226,7 @@ def open_frames(path: Path, settings: ContentSettings) -> Frames:
 
 
 def _suggest(path: Path, picture: U8) -> None:
-    """Log a hint if a picture that is shown as a single view probably contains several."""
+    """Log a hint if a picture shown as a single view probably contains several."""
     if "quilt" in path.stem.lower():
         log.warning("%s: if it is a quilt, pass --layout qs8x6a0.75 (columns, rows, aspect ratio of a view)", path)
     elif found := hint(picture):
@@ -246,7 +246,7 @@ def _open_film(path: Path, settings: ContentSettings) -> Video:
 
 
 def _why_none(folder: Path) -> str:
-    """Return an error message that describes why a folder contains no pictures."""
+    """Return an error message that explains why no pictures were found in a folder."""
     if problem := camera_set_in(folder):
         return problem
     message = "the folder holds no pictures"
@@ -257,9 +257,9 @@ def _why_none(folder: Path) -> str:
 
 
 def read_pair(path: Path, settings: ContentSettings) -> list[U8]:
-    """Read the views of the left and the right eye from one file.
+    """Read the left and right eye's views from one file.
 
-    The views are resized to square pixels, and transparent areas are white. Raises InputError if the file cannot be
+    The views are resized to square pixels, and transparent areas become white. Raises InputError if the file cannot be
     read, or if it does not contain exactly two views.
     """
     views = read_views(path)

@@ -1,7 +1,7 @@
-"""Smooth outlines without multisampling, by drawing a ramp of coverage outside each silhouette edge.
+"""Smooth outlines without multisampling, by drawing a coverage ramp outside each silhouette edge.
 
-A software rasteriser takes four times as long to draw four samples per pixel, whereas outlines have only a few hundred
-edges. A ramp is one pixel wide, which enlarges an object by half a pixel on average.
+On a software rasteriser, drawing four samples per pixel takes four times as long, whereas outlines have only a few
+hundred edges. Each ramp is one pixel wide, so objects are enlarged by half a pixel on average.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ CORNER_ENDS = (0, 0, 1, 1, 0, 1)
 
 @dataclass(frozen=True, slots=True)
 class Edges:
-    """Edges of a triangle mesh and the one or two faces that meet at each edge."""
+    """The edges of a triangle mesh, with the one or two faces that meet at each."""
 
     faces: I32  # (e, 2) indices of the faces at each edge; the second is -1 at a border
-    ends: I32  # (e, 2, 2) vertices of the edge for each face, in the same order for both faces
+    ends: I32  # (e, 2, 2) each face's vertices at the edge's ends, in the same order for both faces
     apex: I32  # (e, 2) third vertex of each face
     normals: F64  # (t, 3) unnormalised normals of all faces
     heights: F64  # (t,) plane offsets; a face is visible from an eye if eye · normal > height
@@ -32,7 +32,7 @@ class Edges:
 
 
 def edges_of(shape: Shape) -> Edges:
-    """Return the edges of a shape. Vertices at the same position are treated as one vertex."""
+    """Return the edges of a shape. Vertices at the same position are treated as one."""
     positions = shape.positions_m.astype(np.float64)
     extent = max(float(np.ptp(positions, axis=0).max()), 1e-9)
     welded = np.unique(np.rint(positions / extent * 1e6).astype(np.int64), axis=0, return_inverse=True)[1].reshape(-1)
@@ -44,7 +44,7 @@ def edges_of(shape: Shape) -> Edges:
     vertices[swapped] = vertices[swapped][:, ::-1]
     key = welded[vertices[:, 0]] * (int(welded.max()) + 1) + welded[vertices[:, 1]]
     places = np.sort(welded[triangles], axis=1)
-    real = np.tile((np.diff(places, axis=1) > 0).all(1), 3)  # a sphere has triangles without area at its poles
+    real = np.tile((np.diff(places, axis=1) > 0).all(1), 3)  # a sphere has zero-area triangles at its poles
     order = np.flatnonzero(real)[np.argsort(key[real], kind="stable")]
     first = np.flatnonzero(np.r_[True, np.diff(key[order]) != 0]) if order.size else np.empty(0, np.int64)
     second = np.minimum(first + 1, max(order.size - 1, 0))
@@ -65,14 +65,14 @@ def edges_of(shape: Shape) -> Edges:
 
 
 class Outlines:
-    """Edges of several parts, among which `seen` selects the outlines that are visible to an eye."""
+    """The edges of several parts. `seen` selects the ones that are on an outline as seen by an eye."""
 
     def __init__(self, each: Sequence[Edges], *, vertices: Sequence[int]) -> None:
         """Combine the edges of all parts. Vertices are numbered consecutively across the parts.
 
         Args:
             each: Edges of each part.
-            vertices: Number of vertices of each part.
+            vertices: Number of vertices in each part.
         """
         faces_before = np.cumsum([0, *(len(edges.normals) for edges in each)])
         self.vertices_before = np.cumsum([0, *vertices])
@@ -88,16 +88,16 @@ class Outlines:
         self._part = np.repeat(np.arange(len(each)), [len(edges.faces) for edges in each])
 
     def seen(self, eyes: Sequence[F64 | None]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Return the edges that are on an outline, and the indices (k,) of the parts to which they belong.
+        """Return the edges that are on an outline, and the index of each edge's part.
 
-        An edge is described by three vertices: its ends and the third vertex of its visible face. The normals of all
-        parts must point outwards.
+        Each edge is described by three vertices: its ends and the third vertex of its visible face. All parts' normals
+        must point outwards.
 
         Args:
-            eyes: Position (3,) of the eye in the frame of each part, or None to exclude the part.
+            eyes: For each part, the eye's position (3,) in the part's frame, or None to exclude the part.
 
         Returns:
-            Vertices (k, 3) and parts (k,) of k edges.
+            The vertices (k, 3) and part indices (k,) of k edges.
         """
         edges = self._edges
         facing = np.zeros(len(edges.normals), bool)
@@ -114,18 +114,18 @@ class Outlines:
 def ramps(points: F64, *, width_px: int, height_px: int, ramp_px: float = 1.0) -> tuple[F32, NDArray[np.intp]]:
     """Return a ramp of two triangles for each outline edge.
 
-    The coverage of a ramp falls from 1 at the edge to 0 outside the outline. Edges that are partly behind the eye or
-    too short to have a direction get no ramp.
+    A ramp's coverage falls from 1 at the edge to 0 outside the outline. An edge gets no ramp if it is partly behind the
+    eye or too short to have a direction.
 
     Args:
-        points: Clip coordinates (k, 3, 4) of the ends of each edge and of the third vertex of its visible face.
-        width_px: Width of the raster.
-        height_px: Height of the raster.
-        ramp_px: Width of a ramp in pixels.
+        points: Clip coordinates (k, 3, 4) of each edge's two ends and of the third vertex of its visible face.
+        width_px: Raster width.
+        height_px: Raster height.
+        ramp_px: Ramp width in pixels.
 
     Returns:
-        Clip coordinates and coverage (m, 6, 5) of the corners of m ramps, and the indices (m,) of their edges. For each
-        of the six corners, `CORNER_ENDS` contains the end of the edge from which the corner takes its attributes.
+        Clip coordinates and coverage (m, 6, 5) at the six corners of each of m ramps, and the index (m,) of each ramp's
+        edge. `CORNER_ENDS` states which end of the edge each corner takes its attributes from.
     """
     scale = np.array([width_px / 2, height_px / 2])
     kept = np.flatnonzero((points[..., 3] > 1e-6).all(1))

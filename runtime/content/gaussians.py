@@ -21,30 +21,30 @@ from runtime.records import F32, F64
 
 log = logging.getLogger("phasestack.content")
 
-LOW_PASS_PX2 = 0.3  # variance added to the projection of each splat, to keep small splats visible between pixels
-ALPHA_MIN = 1 / 255  # smallest alpha of a splat that can change a pixel's 8-bit value
+LOW_PASS_PX2 = 0.3  # variance added to each projected splat, to keep small splats visible between pixels
+ALPHA_MIN = 1 / 255  # smallest splat alpha that can change a pixel's 8-bit value
 LARGEST_COORDINATE = 1e15  # products of two coordinates of this size still fit in float32
-LARGEST_RELATIVE_SCALE = 100.0  # largest scale of a splat, in units of the scene's extent
-STRAY = 1.0  # percentage of splats that bounds exclude as outliers at each end of an axis
-FAINT = 0.1  # opacity up to which bounds ignore a splat
-REACH = 2.0  # standard deviations of each splat that bounds include
-AT_ONCE = 1 << 17  # number of splats that are processed or drawn together, which limits the memory used
-SAMPLED = 10_000  # approximate number of points from which the spacing of points is estimated
+LARGEST_RELATIVE_SCALE = 100.0  # largest splat scale, as a multiple of the scene's extent
+STRAY = 1.0  # percentage of splats excluded from bounds as outliers, at each end of each axis
+FAINT = 0.1  # splats with at most this opacity are ignored in bounds
+REACH = 2.0  # standard deviations of each splat included in bounds
+AT_ONCE = 1 << 17  # number of splats processed or drawn together, to limit memory use
+SAMPLED = 10_000  # approximate number of points used to estimate the spacing of points
 DOTS, MOST_DOTS = 500, 200_000  # largest number of dots: per line on average, and for all lines together
-FINEST_POINT, LARGEST_POINT = 5e-4, 0.01  # limits of a point's standard deviation, in units of the scene's extent
+FINEST_POINT, LARGEST_POINT = 5e-4, 0.01  # limits for a point's standard deviation, as a share of the scene's extent
 FLAT_HARMONIC = 0.28209479177387814  # spherical harmonic of degree 0
 COEFFICIENTS = (0, 9, 24, 45)  # numbers of f_rest properties for harmonics up to degree 0, 1, 2 and 3
-SOLID = 0.3  # alpha above which a splat counts as a surface; two such splats hide half of the background
-SQUARE = 0.89  # half the side of a square that has the area of a disc of radius 1
+SOLID = 0.3  # splats with a higher alpha count as a surface; two such splats hide half of the background
+SQUARE = 0.89  # half the side of a square with the same area as a disc of radius 1
 LARGEST_STEP = 7  # index of the largest square; its half side is 64 blocks
-PACKED = [0, 1, 2, 4, 5, 8]  # row-major indices of the elements that are stored of a symmetric 3x3 matrix
+PACKED = [0, 1, 2, 4, 5, 8]  # row-major indices of a symmetric 3x3 matrix's stored elements
 
 I64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
 class Gaussians:
-    """Scene of n Gaussian splats in a common frame."""
+    """A scene of n Gaussian splats in a common frame."""
 
     centres: F32  # (n, 3)
     covariances: F32  # (n, 6) elements xx, xy, xz, yy, yz, zz
@@ -54,7 +54,7 @@ class Gaussians:
 
 @dataclass(frozen=True, slots=True)
 class Splats:
-    """Ellipses in pixels to which m visible splats are projected for one eye, farthest first."""
+    """The m splats visible to one eye, projected to ellipses in pixels, farthest first."""
 
     index: I64  # (m,) indices of the splats in the scene
     centres_px: F32  # (m, 2)
@@ -66,7 +66,7 @@ class Splats:
 
 
 def load_gaussians(header: PlyHeader) -> Gaussians:
-    """Read the usable splats of a PLY file in the format of the reference implementation.
+    """Read the usable splats in a PLY file that has the reference implementation's format.
 
     Raises InputError if the file is damaged or not binary, a property is missing, or no splat is visible.
     """
@@ -82,7 +82,7 @@ def load_gaussians(header: PlyHeader) -> Gaussians:
         """Return the named properties as columns of an array."""
         if missing := [name for name in wanted if name not in names]:
             raise InputError(path, missing[0], "the property is missing: not a 3D Gaussian splat file")
-        with np.errstate(over="ignore"):  # doubles beyond the range of float32 become infinite
+        with np.errstate(over="ignore"):  # doubles beyond float32's range become infinite
             return np.column_stack([table[name] for name in wanted]).astype(np.float32)
 
     harmonics = np.empty((len(table), 1 + rest // 3, 3), np.float32)
@@ -103,19 +103,19 @@ def load_gaussians(header: PlyHeader) -> Gaussians:
 def drawable(path: Path, *, centres: F32, log_scales: F32, quaternions: F32, logits: F32, harmonics: F32) -> Gaussians:
     """Return the splats that can be drawn.
 
-    Splats are dropped if they are not finite, have no rotation, or are much larger than the scene. The log states how
-    many have been dropped.
+    Splats are dropped if they are not finite, have no rotation, or are much larger than the scene. The number of
+    dropped splats is logged.
 
     Args:
-        path: File of the splats, for messages.
+        path: Splat file, for messages.
         centres: Positions (n, 3).
         log_scales: Natural logarithms (n, 3) of the standard deviations along each splat's axes.
-        quaternions: Rotations (n, 4), ordered w, x, y, z, of any length above 0.
-        logits: Logits (n,) of the opacities.
-        harmonics: Coefficients (n, k, 3) of spherical harmonics.
+        quaternions: Rotations as quaternions (n, 4) in w, x, y, z order, of any length above 0.
+        logits: Opacity logits (n,).
+        harmonics: Spherical-harmonic coefficients (n, k, 3).
 
     Raises:
-        InputError: No visible splat remains.
+        InputError: No visible splats remain.
     """
     with np.errstate(invalid="ignore"):  # comparisons with NaN are false
         usable = (np.abs(centres) < LARGEST_COORDINATE).all(1) & (quaternions != 0).any(1) & ~np.isnan(logits)
@@ -123,7 +123,7 @@ def drawable(path: Path, *, centres: F32, log_scales: F32, quaternions: F32, log
             usable &= np.isfinite(values).all(1)
         some = centres[usable]
         extent = _extent(some) if len(some) else 0.0
-        # The logarithm may be minus infinity, which trainers write for the thickness of a disc.
+        # The logarithm may be minus infinity, which trainers write for a disc's thickness.
         usable &= (log_scales < np.log(LARGEST_RELATIVE_SCALE * (extent or 1.0))).all(1)
     if not usable.all():
         log.warning("%s: is drawn without %d of its %d splats, which are unusable", path, (~usable).sum(), len(usable))
@@ -136,22 +136,22 @@ def drawable(path: Path, *, centres: F32, log_scales: F32, quaternions: F32, log
 
 
 def _extent(places: F32) -> float:
-    """Return the longest side of a box that excludes one percent of the positions at each end of an axis."""
+    """Return the longest side of a box that excludes one percent of positions at each end of each axis."""
     return float(np.ptp(np.percentile(places, [1, 99], axis=0), axis=0).max())
 
 
 def flat_harmonics(colours: F32) -> F32:
-    """Return harmonics (n, 1, 3) of degree 0 for colours (n, 3) that are the same from all directions."""
+    """Return degree-0 harmonics (n, 1, 3) for colours (n, 3) that look the same from all directions."""
     return np.asarray((colours - np.float32(0.5)) / np.float32(FLAT_HARMONIC), np.float32)[:, None]
 
 
 def with_higher(flat: F32, higher: NDArray[Any], *, zero: float = 0.0, unit: float = 1.0) -> F32:
-    """Decode harmonics of higher degrees and append them to those of degree 0.
+    """Decode higher-degree harmonics and append them to those of degree 0.
 
     Args:
         flat: Coefficients (n, 1, 3) of degree 0.
         higher: Encoded coefficients (n, k - 1, 3) of higher degrees, each equal to value / unit + zero.
-        zero: Code of the value 0.
+        zero: Code for the value 0.
         unit: Difference in value between consecutive codes.
 
     Returns:
@@ -165,11 +165,11 @@ def with_higher(flat: F32, higher: NDArray[Any], *, zero: float = 0.0, unit: flo
 
 
 def dotted(ends: F32, colours: F32) -> tuple[F32, F32]:
-    """Convert lines to dense points, whose colours are interpolated along each line.
+    """Convert lines to dense points, with colours interpolated along each line.
 
     Args:
-        ends: Positions (n, 2, 3) of the ends of each line.
-        colours: Colours (n, 2, 3) of the ends.
+        ends: Positions (n, 2, 3) of each line's ends.
+        colours: Colours (n, 2, 3) at the ends.
 
     Returns:
         Positions (m, 3) and colours (m, 3) of the points.
@@ -185,12 +185,12 @@ def dotted(ends: F32, colours: F32) -> tuple[F32, F32]:
 
 
 def of_points(places: F32, colours: F32) -> Gaussians:
-    """Convert points to small round splats whose size is about the spacing of the points.
+    """Convert points to small round splats that are about as large as the spacing between the points.
 
     Args:
         places: Positions (n, 3) of the points.
-        colours: Colours (n, 3), 0-1. A point whose colour is NaN is coloured by its position, because points of one
-            colour would show nothing but an outline.
+        colours: Colours (n, 3), 0-1. A point whose colour is NaN is coloured by its position, because nothing but an
+            outline would be visible if all points had one colour.
     """
     low, high = np.percentile(places, [1, 99], axis=0)
     by_place = 0.25 + 0.7 * np.clip((places - low) / np.maximum(high - low, 1e-30), 0, 1)
@@ -206,7 +206,7 @@ def of_points(places: F32, colours: F32) -> Gaussians:
 
 
 def bounds(gaussians: Gaussians) -> tuple[F64, F64]:
-    """Return the lowest and the highest corner (3,) of a bounding box of the splats.
+    """Return the lowest and highest corners, each (3,), of a bounding box around the splats.
 
     The box includes two standard deviations of each splat, but excludes faint splats and outliers.
     """
@@ -220,11 +220,11 @@ def bounds(gaussians: Gaussians) -> tuple[F64, F64]:
 
 
 def covariances_of(scales: F32, quaternions: F32) -> F32:
-    """Return the covariances R diag(s²) R^T of splats, packed as (n, 6).
+    """Return the splats' covariances R diag(s²) R^T, packed as (n, 6).
 
     Args:
         scales: Standard deviations s (n, 3) along each splat's axes.
-        quaternions: Rotations R (n, 4), ordered w, x, y, z, of any length above 0.
+        quaternions: Rotations R as quaternions (n, 4) in w, x, y, z order, of any length above 0.
     """
     packed = np.empty((len(scales), 6), np.float32)
     for first in range(0, len(scales), AT_ONCE):
@@ -236,7 +236,7 @@ def covariances_of(scales: F32, quaternions: F32) -> F32:
 
 
 def moved(gaussians: Gaussians, target_from_source: F64) -> Gaussians:
-    """Transform splats to another frame by a 4x4 similarity. Harmonics stay in the frame of the file."""
+    """Transform splats to another frame by a 4x4 similarity. Harmonics stay in the file's frame."""
     linear = target_from_source[:3, :3]
     centres = gaussians.centres @ linear.T + target_from_source[:3, 3]
     packed = np.empty_like(gaussians.covariances)
@@ -250,13 +250,13 @@ def moved(gaussians: Gaussians, target_from_source: F64) -> Gaussians:
 def seen_splats(gaussians: Gaussians, view: View, *, nearest_m: float = 1e-3) -> Splats:
     """Project the visible splats to first order (EWA, Zwicker et al. 2001), and sort them by distance.
 
-    The view's 3x4 projection P may lead to the pixels of a panel or to those of an eye's image. The Jacobian of pixel
-    coordinate u_i is (P_i - u_i P_3) / w.
+    The view's 3x4 projection P may map to a panel's pixels or to those of an eye's image. Pixel coordinate u_i has the
+    Jacobian (P_i - u_i P_3) / w.
 
     Args:
         gaussians: Splats in frame `stack`.
-        view: View for which the splats are projected.
-        nearest_m: Splats whose centre is nearer to the eye than this distance are left out.
+        view: View to project the splats into.
+        nearest_m: Splats whose centre is nearer to the eye than this are left out.
     """
     projection = view.pixels_from_stack.astype(np.float32)
     homogeneous = gaussians.centres @ projection[:, :3].T + projection[:, 3]
@@ -299,11 +299,11 @@ def seen_splats(gaussians: Gaussians, view: View, *, nearest_m: float = 1e-3) ->
 
 
 def nearest_blocks(splats: Splats, view: View, *, every: int, first: tuple[int, int]) -> F32:
-    """Return the inverse distances (h, w), in 1/m, of the nearest splats whose alpha exceeds `SOLID`.
+    """Return the inverse distances (h, w), in 1/m, to the nearest splats whose alpha exceeds `SOLID`.
 
-    The arguments and the result are the same as for `ContentSource.nearness`. A splat is treated as a square at the
-    distance of its centre. The square has the area in which alpha exceeds `SOLID`, but half its side is rounded down
-    to 0 or a power of two, in blocks.
+    The arguments and the result are the same as for `ContentSource.nearness`. Each splat is treated as a square at the
+    distance of its centre. The square is as large as the area where alpha exceeds `SOLID`, except that half its side,
+    in blocks, is rounded down to 0 or a power of two.
     """
     shape = -(-(view.height_px + first[1]) // every), -(-(view.width_px + first[0]) // every)
     solid = np.flatnonzero(splats.opacities > SOLID)  # farthest first
@@ -318,15 +318,15 @@ def nearest_blocks(splats: Splats, view: View, *, every: int, first: tuple[int, 
         near = (abs(u - column[some]) <= reach) & (abs(v - row[some]) <= reach)
         u, v, some = u[near].astype(np.intp), v[near].astype(np.intp), some[near]
         layer = np.zeros(shape, np.float32)
-        layer[v, u] = splats.nearness[solid[some]]  # the last of several splats in a block, which is the nearest, wins
+        layer[v, u] = splats.nearness[solid[some]]  # if a block has several splats, the last and nearest one wins
         np.maximum(nearness, cv2.dilate(layer, np.ones((2 * reach + 1,) * 2, np.uint8)), out=nearness)
     return nearness
 
 
 def harmonic_basis(directions: F32, count: int) -> F32:
-    """Return the first `count` real spherical harmonics (n, count) of unit directions (n, 3).
+    """Return the first `count` real spherical harmonics (n, count) for unit directions (n, 3).
 
-    The order and the signs of the harmonics are those of the reference implementation.
+    The harmonics have the same order and signs as in the reference implementation.
     """
     x, y, z = directions.T
     basis = [np.full_like(x, FLAT_HARMONIC)]
@@ -352,11 +352,11 @@ def harmonic_basis(directions: F32, count: int) -> F32:
 
 
 def colours_towards(harmonics: F32, directions: F32) -> F32:
-    """Return the colours (n, 3) of splats as the eye sees them. Negative values are clipped to 0.
+    """Return the splats' colours (n, 3) as seen by the eye. Negative values are clipped to 0.
 
     Args:
-        harmonics: Coefficients (n, k, 3) of spherical harmonics.
-        directions: Unit vectors (n, 3) from the eye to the splats, in the frame of the harmonics.
+        harmonics: Spherical-harmonic coefficients (n, k, 3).
+        directions: Unit vectors (n, 3) from the eye to the splats, in the harmonics' frame.
     """
     if harmonics.shape[1] == 1:
         return np.asarray(np.maximum(harmonics[:, 0] * np.float32(FLAT_HARMONIC) + np.float32(0.5), 0))

@@ -1,4 +1,4 @@
-"""Convert the nodes, primitives and materials of a glTF 2.0 scene to parts, without its animations."""
+"""Convert a glTF 2.0 scene's nodes, primitives and materials to parts, without its animations."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from runtime.records import F32, F64
 from runtime.support import progress, untrusted_input
 from runtime.support.untrusted_input import LIMITS
 
-POINTS, LINES, LOOP, LINE_STRIP, TRIANGLES, STRIP, FAN = range(7)  # modes of primitives
+POINTS, LINES, LOOP, LINE_STRIP, TRIANGLES, STRIP, FAN = range(7)  # primitive modes
 WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 NEAREST = 9728
-PLACES = {"TRANSLATION": "translation", "ROTATION": "rotation", "SCALE": "scale"}  # attributes of instances
+PLACES = {"TRANSLATION": "translation", "ROTATION": "rotation", "SCALE": "scale"}  # instance attributes
 OWN_PROBLEMS = ("an accessor", "bufferViews[", "a primitive", "a data URI")  # first words of this reader's own messages
 DRACO = "KHR_draco_mesh_compression"
 INSTANCES = "EXT_mesh_gpu_instancing"
@@ -41,15 +41,15 @@ WITHOUT = UNSEEN | {
 
 
 class GltfScene:
-    """Loads the scene of a glTF file as parts and points, and records the features that are not drawn."""
+    """Loads a glTF file's scene as parts and points, and records any features that are not drawn."""
 
     def __init__(self, path: Path, data: bytes, read: Read) -> None:
         """Load a scene.
 
         Args:
-            path: File of the scene.
-            data: Contents of the file, as glTF or GLB.
-            read: Function that reads other files to which the scene refers.
+            path: Scene file.
+            data: The file's contents, as glTF or GLB.
+            read: Function that reads other files the scene refers to.
 
         Raises:
             InputError: The file is not glTF 2.0, is damaged, exceeds a limit, or requires an unsupported extension.
@@ -84,18 +84,18 @@ class GltfScene:
         return corners // 3 if primitive.get("mode", TRIANGLES) <= TRIANGLES else corners
 
     def _instances(self, node: Table) -> int:
-        """Return the number of instances that EXT_mesh_gpu_instancing declares for a node, or 1."""
+        """Return the number of instances declared for a node by EXT_mesh_gpu_instancing, or 1."""
         own = node.get("extensions", {}).get(INSTANCES, {}).get("attributes", {})
         return min((self.file.count(index) for name, index in own.items() if name in PLACES), default=1)
 
     def _instanced(self, node: Table, matrix: F64) -> list[F64]:
-        """Return the 4x4 matrix scene_from_mesh of each instance of a node's mesh."""
+        """Return the 4x4 scene_from_mesh matrix for each instance of a node's mesh."""
         own = node.get("extensions", {}).get(INSTANCES, {}).get("attributes", {})
         read = {PLACES[name]: self.file.accessor(index) for name, index in own.items() if name in PLACES}
         return [matrix @ _local({name: rows[k] for name, rows in read.items()}) for k in range(self._instances(node))]
 
     def _textures(self) -> Iterator[Table]:
-        """Yield the texture references of all materials, except for properties that are not drawn."""
+        """Yield all materials' texture references, except those for properties that are not drawn."""
         for material in self.file.all("materials"):
             glossy = material.get("extensions", {}).get(GLOSSY, {})
             base = material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
@@ -116,9 +116,9 @@ class GltfScene:
         self.left_out |= {str(name) for name in file.table.get("extensionsUsed", [])} - DRAWN - UNSEEN - {*COMPRESSED}
 
     def _world(self) -> dict[int, tuple[Table, F64]]:
-        """Return the nodes of the scene by number, each with its 4x4 matrix scene_from_node.
+        """Return the scene's nodes by number, each with its 4x4 scene_from_node matrix.
 
-        Raises InputError if nodes are nested too deep.
+        Raises InputError if nodes are nested too deeply.
         """
         nodes, scenes = self.file.all("nodes"), self.file.all("scenes")
         children = {child for node in nodes for child in node.get("children", [])}
@@ -138,7 +138,7 @@ class GltfScene:
         return placed_nodes
 
     def _joints(self, node: Table, world: dict[int, tuple[Table, F64]]) -> F64:
-        """Return matrices scene_from_mesh (j, 4, 4) for the joints of a node's skin (section 3.7.3)."""
+        """Return the scene_from_mesh matrices (j, 4, 4) for the joints of a node's skin (section 3.7.3)."""
         skin = self.file.item("skins", node["skin"])
         stand = np.array([world[joint][1] if joint in world else np.eye(4) for joint in skin["joints"]])
         if "inverseBindMatrices" not in skin:
@@ -147,12 +147,12 @@ class GltfScene:
         return np.asarray(stand @ columns[: len(stand)].transpose(0, 2, 1))
 
     def _add(self, primitive: Table, *, weights: list[float], matrices: F64) -> None:
-        """Add the triangles, lines or points of a primitive to the scene.
+        """Add a primitive's triangles, lines or points to the scene.
 
         Args:
             primitive: Primitive as described in the file.
-            weights: Weights of the primitive's morph targets.
-            matrices: Matrix scene_from_mesh (4, 4) or, for a skinned mesh, one matrix (j, 4, 4) for each joint.
+            weights: Weights for the primitive's morph targets.
+            matrices: The scene_from_mesh matrix (4, 4) or, for a skinned mesh, one matrix per joint (j, 4, 4).
         """
         file, mode = self.file, primitive.get("mode", TRIANGLES)
         if "POSITION" not in primitive["attributes"]:
@@ -165,7 +165,7 @@ class GltfScene:
         faces = _faces(corners, mode)
         has_normals = "NORMAL" in primitive["attributes"] and mode >= TRIANGLES
         if has_normals or mode < TRIANGLES:
-            rows, faces = np.unique(faces, return_inverse=True)  # drop vertices that only other primitives use
+            rows, faces = np.unique(faces, return_inverse=True)  # drop vertices used only by other primitives
         else:  # flat shading requires that triangles share no vertices (section 3.7.2.1)
             rows, faces = faces.reshape(-1), np.arange(faces.size).reshape(-1, 3)
 
@@ -206,10 +206,10 @@ class GltfScene:
         self.parts.append(Part(shape, vertex_colours=colours, is_linear=not is_plain, **look))
 
     def _skinned(self, joints: F64, attribute: Any) -> F64:
-        """Return matrices (v, 4, 4) for all vertices, each a weighted mean of the matrices of joints.
+        """Return one matrix per vertex (v, 4, 4), each a weighted mean of the joints' matrices.
 
         Args:
-            joints: Matrices (j, 4, 4) of all joints.
+            joints: The joints' matrices (j, 4, 4).
             attribute: Function that returns a vertex attribute by name, or None.
         """
         names, weights = attribute("JOINTS_0"), attribute("WEIGHTS_0")
@@ -224,10 +224,10 @@ class GltfScene:
         return total
 
     def _draco(self, primitive: Table) -> tuple[dict[str, Array], Array | None]:
-        """Decode the attributes and the vertex indices of a primitive that is compressed with Draco.
+        """Decode the attributes and vertex indices of a primitive compressed with Draco.
 
-        The results are empty and None if the primitive is not compressed, or if DracoPy is not installed and the file
-        contains the same data uncompressed. Raises InputError if compressed data are needed but cannot be decoded.
+        Returns an empty dict and None if the primitive is not compressed, or if DracoPy is not installed but the file
+        also contains the data uncompressed. Raises InputError if compressed data are needed but cannot be decoded.
         """
         own = primitive.get("extensions", {}).get(DRACO)
         if own is None:
@@ -236,7 +236,7 @@ class GltfScene:
             import DracoPy
         except ImportError:
             accessors = [self.file.item("accessors", index) for index in primitive["attributes"].values()]
-            if all("bufferView" in accessor for accessor in accessors):  # the file contains the same data uncompressed
+            if all("bufferView" in accessor for accessor in accessors):  # the file also contains the data uncompressed
                 return {}, None
             problem = f"Draco needs `pip install 'phasestack[draco]'`; or {WAY_OUT}"
             raise InputError(self.path, DRACO, problem) from None
@@ -254,10 +254,10 @@ class GltfScene:
         return values, np.asarray(decoded.faces).reshape(-1)
 
     def _look(self, index: int | None) -> tuple[dict[str, Any], Table]:
-        """Convert a material to fields of `Part`, with linear colours.
+        """Convert a material to `Part` fields, with linear colours.
 
         Returns:
-            The fields, and the reference from the material to its texture, which states the texture coordinates.
+            The fields, and the material's texture reference, which states which texture coordinates to use.
         """
         file, material = self.file, {} if index is None else self.file.item("materials", index)
         own = material.get("extensions", {})
@@ -293,7 +293,7 @@ class GltfScene:
 
 
 def _problem(error: Exception) -> str:
-    """Return a description of the error that was raised while reading a file."""
+    """Describe an error raised while reading a file."""
     if isinstance(error, KeyError):
         return f"{untrusted_input.shown(str(error))} is missing"
     if isinstance(error, IndexError):
@@ -303,7 +303,7 @@ def _problem(error: Exception) -> str:
 
 
 def _local(node: Table) -> F64:
-    """Return the 4x4 matrix parent_from_node of a node."""
+    """Return a node's 4x4 parent_from_node matrix."""
     if "matrix" in node:
         return np.asarray(np.array(node["matrix"], np.float64).reshape(4, 4).T)
     x, y, z, w = node.get("rotation", (0.0, 0.0, 0.0, 1.0))

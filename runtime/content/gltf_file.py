@@ -1,4 +1,4 @@
-"""Read the JSON, the buffers, the accessors and the pictures of a glTF 2.0 file.
+"""Read the JSON, buffers, accessors and pictures in a glTF 2.0 file.
 
 No existing library is suitable: trimesh drops samplers, sparse accessors and normalized integers, pygltflib does not
 decode accessors, and assimp-py does not return embedded pictures.
@@ -27,9 +27,9 @@ from runtime.support.untrusted_input import LIMITS
 
 Table = dict[str, Any]
 Array = NDArray[Any]
-Read = Callable[[str], bytes]  # reads a file to which the scene refers, given its URI or name
+Read = Callable[[str], bytes]  # reads a file that the scene refers to, given its URI or name
 
-ELEMENTS_PER_TRIANGLE = 10  # most elements in all accessors together, per triangle that the limits allow
+ELEMENTS_PER_TRIANGLE = 10  # most elements in all accessors together, per triangle allowed by the limits
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 SHAPES = {"SCALAR": (1,), "VEC2": (2,), "VEC3": (3,), "VEC4": (4,), "MAT2": (2, 2), "MAT3": (3, 3), "MAT4": (4, 4)}
 PICTURE_EXTENSIONS = ("EXT_texture_webp", "EXT_texture_avif")  # formats that are decoded, unlike KTX2
@@ -43,7 +43,7 @@ WAY_OUT = "save it without that compression, in Blender or with `gltf-transform`
 
 
 class GltfFile:
-    """Reads the objects of a glTF 2.0 file by number.
+    """Reads objects in a glTF 2.0 file by number.
 
     All methods raise LookupError, TypeError or ValueError if the file is malformed, and InputError if data are missing,
     unsupported or larger than a limit.
@@ -64,7 +64,7 @@ class GltfFile:
             untrusted_input.within(elements, most, source=path, field=f"accessors[{number}].count")
 
     def all(self, kind: str) -> list[Table]:
-        """Return all objects of a kind, such as `meshes`. The list is empty if the file contains none."""
+        """Return all objects of a given kind, such as `meshes`. The list is empty if the file has none."""
         objects: list[Table] = self.table.get(kind, [])
         return objects
 
@@ -77,11 +77,11 @@ class GltfFile:
         return _count(self.item("accessors", accessor))
 
     def accessor(self, index: int, *, rows: Array | None = None, as_float: bool = True) -> Array:
-        """Return the elements (n, ...) of an accessor.
+        """Return an accessor's elements (n, ...).
 
         Args:
-            index: Number of the accessor.
-            rows: Indices of the elements to return. All elements are returned by default.
+            index: Accessor number.
+            rows: Indices of the elements to return. By default, all elements are returned.
             as_float: Convert the elements to float32 with `fractions`. If False, numbers are returned as stored.
         """
         accessor = self.item("accessors", index)
@@ -96,7 +96,7 @@ class GltfFile:
         return fractions(values, accessor) if as_float else values
 
     def _stored(self, accessor: Table) -> Array:
-        """Return a strided view of the bytes of an accessor, or zeros if the accessor has no buffer view."""
+        """Return a strided view of an accessor's bytes, or zeros if it has no buffer view."""
         count, shape = _count(accessor), SHAPES[accessor["type"]]
         dtype = np.dtype(COMPONENTS[accessor["componentType"]])
         column = shape[0] * dtype.itemsize
@@ -115,7 +115,7 @@ class GltfFile:
         return np.ndarray((count, *shape), dtype, data, first, (stride, *strides))
 
     def view(self, index: int) -> tuple[memoryview, int]:
-        """Return the bytes of a buffer view, and its stride in bytes, which is 0 if elements are contiguous."""
+        """Return a buffer view's bytes, and its stride in bytes (0 if its elements are contiguous)."""
         view = self.item("bufferViews", index)
         number, first, size = view["buffer"], view.get("byteOffset", 0), view["byteLength"]
         buffer = self._buffer(number)
@@ -151,9 +151,9 @@ class GltfFile:
             raise ValueError(f"a data URI that is not base64: {error}") from None
 
     def picture(self, texture: Table) -> U8:
-        """Return the picture of a texture as an RGBA array (h, w, 4).
+        """Return a texture's picture as an RGBA array (h, w, 4).
 
-        `check_pictures` must have checked the picture before. Raises InputError if the picture cannot be decoded.
+        Call `check_pictures` first. Raises InputError if the picture cannot be decoded.
         """
         number = self._image_of(texture)
         if number not in self._pictures:
@@ -164,7 +164,7 @@ class GltfFile:
     def check_pictures(self, textures: list[Table]) -> None:
         """Check the headers of all pictures before any picture is decoded.
 
-        Raises InputError if a picture or all pictures together have too many pixels.
+        Raises InputError if one picture, or all pictures together, have too many pixels.
         """
         pixels = 0
         for number in sorted({self._image_of(texture) for texture in textures}):
@@ -176,7 +176,7 @@ class GltfFile:
             untrusted_input.within(pixels, LIMITS.texture_pixels, source=self.path, field="textures' pixels")
 
     def _image_of(self, texture: Table) -> int:
-        """Return the number of a texture's image, preferring images in the formats of extensions.
+        """Return the number of a texture's image, preferring images in formats added by extensions.
 
         Raises InputError if the texture has no image in a supported format.
         """
@@ -190,13 +190,13 @@ class GltfFile:
         raise InputError(self.path, "textures", problem)
 
     def _coded(self, number: int) -> bytes:
-        """Return the encoded bytes of an image."""
+        """Return an image's encoded bytes."""
         image = self.item("images", number)
         return self._of_uri(image["uri"]) if "uri" in image else bytes(self.view(image["bufferView"])[0])
 
 
 def fractions(values: Array, accessor: Table) -> F32:
-    """Convert numbers of an accessor to float32. Normalized integers become fractions (section 3.6.2.2)."""
+    """Convert an accessor's numbers to float32. Normalized integers become fractions (section 3.6.2.2)."""
     floats = np.asarray(values, np.float32)
     if accessor.get("normalized", False) and values.dtype.kind in "iu":
         floats = np.maximum(floats / np.float32(np.iinfo(values.dtype).max), np.float32(-1.0))
@@ -211,7 +211,7 @@ def _count(accessor: Table) -> int:
 
 
 def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes]:
-    """Return the JSON text and the binary buffer of a GLB file. Raises InputError if the file is cut off."""
+    """Return a GLB file's JSON text and binary buffer. Raises InputError if the file is cut off."""
     if int.from_bytes(data[4:8], "little") == 1:
         raise InputError(path, "asset.version", VERSION_1)
     size = int.from_bytes(data[12:16], "little")

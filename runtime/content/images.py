@@ -1,4 +1,4 @@
-"""Warp pictures whose projection is known to the raster of a view."""
+"""Warp pictures with a known projection to a view's raster."""
 
 from __future__ import annotations
 
@@ -11,39 +11,39 @@ from runtime.optics.stack import PlaneRaster
 from runtime.optics.views import image_from_raster
 from runtime.records import F64, U8
 
-# Pixel centres are half-integers here, but integers in OpenCV.
+# Pixel centres have half-integer coordinates here, but integer coordinates in OpenCV.
 _HALF = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
 _MINUS_HALF = np.array([[1.0, 0.0, -0.5], [0.0, 1.0, -0.5], [0.0, 0.0, 1.0]])
 
 
 def rgba_from_rgb(rgb: U8) -> U8:
-    """Convert an RGB picture (h, w, 3) to opaque RGBA (h, w, 4), which OpenCV warps in half the time."""
+    """Convert an RGB picture (h, w, 3) to opaque RGBA (h, w, 4). OpenCV warps RGBA in half the time."""
     return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA))
 
 
 def image_from_view(image_from_stack: F64, pixels_from_stack: F64, *, x_m: float) -> F64 | None:
-    """Return the 3x3 homography from the pixels of a view to those of a picture that appears on a plane.
+    """Return the 3x3 homography from a view's pixels to those of a picture shown on a plane.
 
-    The choice of the plane does not matter if the picture and the view belong to the same eye position.
+    If the picture and the view belong to the same eye position, it does not matter which plane is chosen.
 
     Args:
-        image_from_stack: Projection (3, 4) to the pixels of the picture.
-        pixels_from_stack: Projection (3, 4) to the pixels of the view.
+        image_from_stack: Projection (3, 4) to the picture's pixels.
+        pixels_from_stack: Projection (3, 4) to the view's pixels.
         x_m: The plane is x = `x_m` in frame `stack`.
 
     Returns:
-        The homography, or None if the eye of the view is in the plane.
+        The homography, or None if the view's eye is in the plane.
     """
-    # The pixel coordinates of this raster are metres along y (u) and -z (v).
+    # This raster's pixel coordinates are metres along y (u) and -z (v).
     plane = PlaneRaster(x_m=x_m, left_m=0.0, top_m=0.0, pitch_u_m=1.0, pitch_v_m=1.0, width_px=1, height_px=1)
     plane_from_view = plane_from_pixels(pixels_from_stack, plane)
     return None if plane_from_view is None else image_from_raster(image_from_stack, plane) @ plane_from_view
 
 
 def plane_from_pixels(pixels_from_stack: F64, plane: PlaneRaster) -> F64 | None:
-    """Return the 3x3 homography from the pixels of a view to the pixels of a plane.
+    """Return the 3x3 homography from a view's pixels to a plane's pixels.
 
-    The result is None if the eye of the view is in the plane.
+    Returns None if the view's eye is in the plane.
     """
     try:
         return panel_from_image(pixels_from_stack, plane)
@@ -52,10 +52,10 @@ def plane_from_pixels(pixels_from_stack: F64, plane: PlaneRaster) -> F64 | None:
 
 
 def reduction(picture_from_view: F64, view: View) -> int:
-    """Return how often to halve a picture before a warp, which limits aliasing.
+    """Return how many times to halve a picture before warping it, to limit aliasing.
 
-    Neighbouring pixels at the middle of the view are then less than 1.5 pixels of the picture apart, along at least one
-    axis of the view.
+    Neighbouring pixels in the middle of the view are then less than 1.5 picture pixels apart, along at least one of the
+    view's axes.
     """
     middle = np.array([view.width_px, view.height_px]) / 2 + np.array([[0, 0], [1, 0], [0, 1]])
     mapped = cv2.perspectiveTransform(middle[None], picture_from_view)[0]
@@ -64,7 +64,7 @@ def reduction(picture_from_view: F64, view: View) -> int:
 
 
 class WarpedPicture:
-    """Picture that can be warped to the raster of a view. Reduced copies of the picture limit aliasing."""
+    """Picture that can be warped to a view's raster. Keeps reduced copies to limit aliasing."""
 
     def __init__(self, rgba: U8, *, background: tuple[float, float, float]) -> None:
         self._levels = [np.ascontiguousarray(rgba)]
@@ -78,9 +78,9 @@ class WarpedPicture:
         overwrites the array.
 
         Args:
-            picture_from_view: Homography (3, 3) from the pixels of the view to those of the picture. If None, only the
-                background is drawn.
-            view: View whose raster is used.
+            picture_from_view: Homography (3, 3) from the view's pixels to the picture's. If None, only the background
+                is drawn.
+            view: View that determines the raster.
         """
         key = (view.width_px, view.height_px, view.side)
         if key not in self._out:

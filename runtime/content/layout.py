@@ -1,6 +1,7 @@
 """Determine how views are arranged in a picture.
 
-The arrangement follows from settings, file headers or file names. The similarity of a picture's halves gives a hint.
+The arrangement is taken from settings, file headers or file names. If a picture's halves are similar, this gives a
+hint.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from runtime.records import U8
 QUILT = re.compile(r"(?<![a-z0-9])qs([0-9]{1,6})x([0-9]{1,6})(?:a([0-9]*\.?[0-9]+))?(?![0-9])")
 ASPECT_MIN, ASPECT_MAX = 0.05, 20.0  # width over height of one view
 RIGHT_FIRST = (".jps", ".pns")  # formats that are side by side and cross-eyed by convention
-MARKS = {  # words that are accepted anywhere in a name
+MARKS = {  # words accepted anywhere in a name
     "half-side-by-side": "(half|h) ?(sbs|side by side|lr|left right)|sbs h(alf)?",
     "half-top-bottom": "(half|h) ?(tb|tab|over under|top bottom)|(half|h|3d) (ou|hou)|halfou|(ou|tb|tab) half",
     "cross-eyed": "cross ?eyed?|crossview|sbs rl",
@@ -29,38 +30,38 @@ MARKS = {  # words that are accepted anywhere in a name
     "anaglyph": "anaglyph",
     "rgbd": "rgbd",
 }
-LAST_MARKS = {  # ambiguous words, accepted only at the end or before words with digits such as 1080p
+LAST_MARKS = {  # ambiguous words, accepted only at the end or before words with digits, such as 1080p
     "half-top-bottom": "hou",
     "cross-eyed": "rl|right left",
     "side-by-side": "lr|left right|2x1|parallel",
     "top-bottom": "ou|tb|tab|top bottom|1x2",
 }
-COPY = re.compile(r"( copy)?( ?\([0-9]+\))?$")  # suffix that a browser or desktop adds to the name of a copy
-NARROW, LOW = 2.5, 1.28  # a film's aspect ratio below (side-by-side) or above (top-bottom) which views are squeezed
-FULL = re.compile(r"(^|[^a-z])(full|fsbs|ftb|fou)")  # mark in a film's name if its views are not squeezed
-ALIKE = 0.8  # correlation above which the halves of a picture may be two views
-SMALL_PX = (64, 48)  # size to which halves are reduced for comparison
+COPY = re.compile(r"( copy)?( ?\([0-9]+\))?$")  # suffix added to a copy's name by a browser or desktop
+NARROW, LOW = 2.5, 1.28  # a film is squeezed if its aspect ratio is below (side-by-side) or above (top-bottom) this
+FULL = re.compile(r"(^|[^a-z])(full|fsbs|ftb|fou)")  # mark in the names of films whose views are not squeezed
+ALIKE = 0.8  # a picture's halves may be two views if their correlation exceeds this
+SMALL_PX = (64, 48)  # halves are reduced to this size for comparison
 SHIFT_PX = 6  # largest shift between views, in pixels of the reduced halves
-ROUGH = 6.0  # standard deviation in 8-bit values; smoother halves always correlate, so they are not compared
+ROUGH = 6.0  # least standard deviation in 8-bit values; smoother halves always correlate, so they are not compared
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Arrangement of views in a picture. The method `views` splits a picture accordingly."""
+    """A picture's view arrangement. The method `views` splits a picture accordingly."""
 
     kind: str  # mono, rgbd, quilt, side-by-side, top-bottom or anaglyph
     columns: int = 1
     rows: int = 1
     half: bool = False  # True if the views are squeezed to half their width or height
     right_first: bool = False  # True if the right eye's view comes first
-    span_deg: int = 0  # longitude that equirectangular views cover, or 0 for flat views
+    span_deg: int = 0  # longitude covered by equirectangular views, or 0 for flat views
     view_aspect: float = 0.0  # width over height of a quilt's views, or 0 if their pixels are square
 
     def views(self, picture: U8) -> list[U8]:
-        """Split a picture into its views, in the order of `parts`. Equirectangular views are cropped.
+        """Split a picture into its views, ordered as in `parts`. Equirectangular views are cropped.
 
-        The crop is the part of a view that is straight ahead. Raises ValueError if the picture is smaller than one
-        pixel per view.
+        The crop keeps the part of each view that is straight ahead. Raises ValueError if the picture is smaller than
+        one pixel per view.
         """
         parts = self.parts(picture)
         height, width = parts[0].shape[:2]
@@ -72,8 +73,8 @@ class Layout:
     def parts(self, picture: U8) -> list[U8]:
         """Split a picture into its views, without cropping them.
 
-        The result is [left, right], a single view, or the views of a quilt from the leftmost to the rightmost camera.
-        Raises ValueError if the picture is smaller than one pixel per view.
+        Returns [left, right], a single view, or a quilt's views from the leftmost to the rightmost camera. Raises
+        ValueError if the picture is smaller than one pixel per view.
         """
         height, width = picture.shape[:2]
         if not 0 < self.columns <= width or not 0 < self.rows <= height:
@@ -94,22 +95,22 @@ class Layout:
         ]
 
     def pixel_aspect(self, *, width_px: int, height_px: int) -> float:
-        """Return the aspect ratio (width over height) of pixels in a view that has the given size."""
+        """Return the aspect ratio (width over height) of the pixels in a view of the given size."""
         if self.half:
             return float(self.columns) if self.columns > 1 else 1 / self.rows
         return self.view_aspect * height_px / width_px if self.view_aspect else 1.0
 
 
-MONO, PAIR = Layout("mono"), Layout("side-by-side", columns=2)  # PAIR is for files that contain two pictures
+MONO, PAIR = Layout("mono"), Layout("side-by-side", columns=2)  # PAIR is for files with two pictures in them
 
 
 def layout_of(path: Path, settings: ContentSettings, *, stated: str = "") -> Layout:
-    """Return the layout of a file from the settings, its header, or its name, in this order.
+    """Return a file's layout, taken from the settings, its header or its name, in that order.
 
     Args:
-        path: File or folder, whose name may contain the layout.
-        settings: Settings of the content.
-        stated: Layout that the file's header declares, in the syntax of `content.layout`, or an empty string.
+        path: File or folder. Its name may state the layout.
+        settings: Content settings.
+        stated: Layout declared by the file's header, in the syntax of `content.layout`, or an empty string.
 
     Raises:
         InputError: A quilt has no views, or an implausible aspect ratio.
@@ -133,13 +134,13 @@ def layout_of(path: Path, settings: ContentSettings, *, stated: str = "") -> Lay
 
 
 def of_film(layout: Layout, path: Path, *, width_px: int, height_px: int) -> Layout:
-    """Return the layout of a film, whose views are squeezed if the frame has the shape of a single view.
+    """Return a film's layout, with squeezed views if the frame has the shape of a single view.
 
     Args:
-        layout: Layout that the film's name or header states.
-        path: File of the film. A mark such as `full` in the name means that views are not squeezed.
-        width_px: Width of a frame.
-        height_px: Height of a frame.
+        layout: Layout stated by the film's name or header.
+        path: Film file. A mark such as `full` in its name means that the views are not squeezed.
+        width_px: Frame width.
+        height_px: Frame height.
     """
     aspect = width_px / height_px
     squeezed = {"side-by-side": aspect < NARROW, "top-bottom": aspect > LOW}.get(layout.kind, False)
@@ -148,7 +149,7 @@ def of_film(layout: Layout, path: Path, *, width_px: int, height_px: int) -> Lay
 
 
 def _named(path: Path) -> str:
-    """Return the layout that a file or folder name states, in the syntax of `content.layout`."""
+    """Return the layout stated by a file or folder name, in the syntax of `content.layout`."""
     if path.suffix.lower() in RIGHT_FIRST:
         return "cross-eyed"
     stem = COPY.sub("", path.name if path.is_dir() else path.stem).lower()
@@ -163,7 +164,7 @@ def _named(path: Path) -> str:
 
 
 def _span_deg(path: Path) -> int:
-    """Return the longitude that a file name states, 360 or 180 degrees, or 0 if the name states none."""
+    """Return the longitude stated by a file name: 360 or 180 degrees, or 0 if it states none."""
     words = re.split(r"[^a-z0-9]+", path.stem.lower())
     if {"180", "vr180", "180x180"} & set(words):
         return 180
@@ -171,9 +172,9 @@ def _span_deg(path: Path) -> int:
 
 
 def hint(picture: U8) -> str:
-    """Return the layout that a picture probably has, or an empty string.
+    """Return a picture's probable layout, or an empty string.
 
-    The halves of a picture are probably two views if they correlate after a small shift.
+    A picture's halves are probably two views if they correlate after a small shift.
     """
     for layout in ("side-by-side", "top-bottom"):
         columns = 2 if layout == "side-by-side" else 1

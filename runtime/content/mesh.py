@@ -28,28 +28,28 @@ from runtime.support.untrusted_input import LIMITS
 
 log = logging.getLogger("phasestack.content")
 
-STL_HEAD, STL_FACET = 84, 50  # sizes in bytes of a binary file's header and of a triangle
-UNREAD = ("tristrips", "edge")  # elements of PLY files that are not drawn
+STL_HEAD, STL_FACET = 84, 50  # sizes of a binary file's header and of each triangle, in bytes
+UNREAD = ("tristrips", "edge")  # PLY elements that are not drawn
 OFF_COUNTS = re.compile(rb"^\s*[A-Z4n]*OFF\s+(?:#.*\s+)*(\d{1,18})\s+(\d{1,18})")
 
 
 @dataclass(frozen=True, slots=True)
 class MeshData:
-    """Triangles or points of a mesh file, in the file's coordinates."""
+    """Triangles or points from a mesh file, in the file's coordinates."""
 
     parts: tuple[Part, ...]
     points: tuple[tuple[F32, F32], ...]  # positions (n, 3) and colours (n, 3); empty if there are parts
     low: F64  # (3,) lowest corner of the bounding box
     high: F64  # (3,) highest corner of the bounding box
     facing: F64  # (3,) area-weighted mean normal; the length is at most 1, and 0 for a closed surface
-    left_out: tuple[str, ...] = ()  # features of the file that are not drawn
+    left_out: tuple[str, ...] = ()  # features in the file that are not drawn
 
 
 def prepare(file: SceneFile) -> Callable[..., ContentSource]:
     """Read a mesh file, and return a function that creates the source in a GL context.
 
-    The edges of small meshes are prepared here, because this needs no GL context. Raises InputError if the mesh cannot
-    be drawn.
+    The edges of small meshes are found at this stage, because doing so needs no GL context. Raises InputError if the
+    mesh cannot be drawn.
     """
     data = load_mesh(file.path)
     if data.left_out:
@@ -71,8 +71,7 @@ def prepare(file: SceneFile) -> Callable[..., ContentSource]:
 def load_mesh(path: Path) -> MeshData:
     """Read a mesh file.
 
-    Raises InputError if the file is damaged, exceeds a limit, has coordinates that are not finite, or contains nothing
-    that can be drawn.
+    Raises InputError if the file is damaged, exceeds a limit, has non-finite coordinates, or contains nothing to draw.
     """
     progress.tell(f"reading {path.name}", 0)
     data = untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)
@@ -115,13 +114,13 @@ def load_mesh(path: Path) -> MeshData:
 
 
 def folder_reader(path: Path, field: str) -> Callable[[str], bytes]:
-    """Return a function that reads files to which a mesh refers by URI or path.
+    """Return a function that reads the files a mesh refers to by URI or path.
 
     The function keeps the contents of each file in memory. It raises InputError if a reference is not a relative path,
     or if the file cannot be read.
 
     Args:
-        path: File of the mesh.
+        path: Mesh file.
         field: Kind of reference, for error messages.
     """
     read_files: dict[str, bytes] = {}
@@ -136,7 +135,7 @@ def folder_reader(path: Path, field: str) -> Callable[[str], bytes]:
 
 
 def _file_of(uri: str, *, source: Path, field: str) -> Path:
-    """Return the path to which a URI or relative path in the file `source` refers.
+    """Return the path of the file that a URI or relative path in the file `source` refers to.
 
     Raises InputError if the URI has a scheme, the path is absolute, or the file does not exist.
     """
@@ -152,7 +151,7 @@ def _file_of(uri: str, *, source: Path, field: str) -> Path:
 
 
 def _check(path: Path, parts: Sequence[Part], places: Sequence[F32], left_out: set[str]) -> None:
-    """Raise InputError if there is nothing to draw, or if coordinates are not finite or too large."""
+    """Raise InputError if there is nothing to draw, or if any coordinate is not finite or too large."""
     if not any(len(place) for place in places):
         alone = f", and {' and '.join(sorted(left_out))} are not drawn" if left_out else ""
         raise InputError(path, "faces", f"the file has none{alone}")
@@ -187,7 +186,7 @@ def _is_binary_stl(path: Path, data: bytes) -> bool:
 
 
 def _binary_stl(data: bytes) -> Part:
-    """Read a binary STL file. The largest files would take ten times as much memory with trimesh."""
+    """Read a binary STL file without trimesh, which needs ten times the memory for the largest files."""
     facets = np.frombuffer(data, [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")], offset=STL_HEAD)
     corners = np.ascontiguousarray(facets["corners"])
     triangles = np.arange(3 * len(facets), dtype=np.int32).reshape(-1, 3)

@@ -28,15 +28,15 @@ from runtime.support.untrusted_input import LIMITS
 log = logging.getLogger("phasestack.content")
 
 BOMS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-# Options before the name of a texture in an MTL file, such as `-s 1 1 1`, `-blendu off` or `-imfchan r`.
+# Options that precede a texture's name in an MTL file, such as `-s 1 1 1`, `-blendu off` or `-imfchan r`.
 OPTIONS = re.compile(r"(?:-[a-zA-Z]+(?:\s+(?:on|off|[rgbmlz]|[-+.\d]+(?:[eE][-+]?\d+)?))*\s+)+")
-DRIVE = re.compile(r"[A-Za-z]:.*/")  # folder on the author's Windows machine, which is removed from a path
+DRIVE = re.compile(r"[A-Za-z]:.*/")  # folder on the author's Windows machine, which is stripped from paths
 
 
 class FolderResolver(trimesh.resolvers.FilePathResolver):
-    """Reads the files to which a mesh refers, for the loaders of trimesh.
+    """Resolver that trimesh's loaders use to read the files a mesh refers to.
 
-    A missing material file is replaced by an empty file, and a missing texture by a grey one. Other problems are kept
+    A missing material file is replaced by an empty file, and a missing texture by a grey one. Other problems are stored
     in `refused`, because the loaders discard exceptions.
     """
 
@@ -70,8 +70,8 @@ class FolderResolver(trimesh.resolvers.FilePathResolver):
     def _named(self, name: str) -> str | None:
         """Return the name of an existing file in the mesh's folder, or None if no file matches.
 
-        The given name may contain options of an MTL file, a Windows path, or letters in the wrong case. Absolute paths
-        are returned unchanged.
+        The given name may contain MTL options, a Windows path, or letters in the wrong case. Absolute paths are
+        returned unchanged.
         """
         name = DRIVE.sub("", OPTIONS.sub("", name, count=1).strip().replace("\\", "/"))
         untrusted_input.checked_path(name, source=self._path, field="texture")
@@ -85,18 +85,18 @@ class FolderResolver(trimesh.resolvers.FilePathResolver):
 
 
 def read_mesh(path: Path, data: bytes, read: Read) -> tuple[list[Part], list[tuple[F32, F32]]]:
-    """Convert a mesh file to parts, and the points or lines in a file to points with colours.
+    """Convert a mesh file's triangles to parts, and its points or lines to coloured points.
 
     Args:
-        path: File of the mesh.
-        data: Contents of the file.
-        read: Function that reads other files to which the mesh refers.
+        path: Mesh file.
+        data: The file's contents.
+        read: Function that reads other files the mesh refers to.
 
     Returns:
-        The parts, and pairs of positions (n, 3) and colours (n, 3) of points.
+        The parts, and the points as pairs of positions (n, 3) and colours (n, 3).
 
     Raises:
-        InputError: The file is damaged, or a file to which it refers cannot be used.
+        InputError: The file is damaged, or a file it refers to cannot be used.
     """
     kind = path.suffix.lower().removeprefix(".")
     progress.tell(f"{path.name}: triangles", 0)
@@ -110,7 +110,7 @@ def read_mesh(path: Path, data: bytes, read: Read) -> tuple[list[Part], list[tup
         meshes = [(scene.geometry[name], matrix) for matrix, name in map(scene.graph.get, scene.graph.nodes_geometry)]
         has_faces = any(len(getattr(mesh, "faces", ())) for mesh, _ in meshes)
         wires = _wires(file) if isinstance(file, io.StringIO) and not has_faces else None
-    except Exception as error:  # loaders of trimesh raise various errors
+    except Exception as error:  # trimesh's loaders raise various errors
         if resolver.refused is not None:
             raise resolver.refused from None
         why = (
@@ -134,15 +134,15 @@ def read_mesh(path: Path, data: bytes, read: Read) -> tuple[list[Part], list[tup
 
 
 def _text(data: bytes) -> str:
-    """Decode an OBJ file in UTF-16 or UTF-8.
+    """Decode an OBJ file encoded in UTF-16 or UTF-8.
 
-    Invalid characters are replaced, because characters outside ASCII can occur only in names and comments.
+    Invalid characters are replaced. This is harmless, because only names and comments can contain non-ASCII characters.
     """
     return data.decode("utf-16" if data[:2] in BOMS else "utf-8", errors="replace")
 
 
 def _wires(file: io.StringIO) -> F32 | None:
-    """Return the ends (n, 2, 3) of the lines in an OBJ file, or None if the file contains no lines."""
+    """Return the ends (n, 2, 3) of the lines in an OBJ file, or None if it contains no lines."""
     places: list[list[str]] = []
     ends: list[tuple[int, int]] = []
     for kind, *words in filter(None, map(str.split, file.getvalue().splitlines())):
@@ -170,13 +170,13 @@ def _points(cloud: Any) -> list[tuple[F32, F32]]:
 
 
 def _part(mesh: Any, matrix: F64, path: Path, pictures: dict[int, U8]) -> Part:
-    """Convert a mesh of trimesh to a part with a material, with vertex or face colours, or in plain grey.
+    """Convert a trimesh mesh to a part with a material, with vertex or face colours, or in plain grey.
 
     Args:
-        mesh: Mesh that trimesh has loaded.
-        matrix: Matrix (4, 4) from the frame of the mesh to that of the scene.
-        path: File of the mesh.
-        pictures: Textures that have already been converted, by the `id` of their material. The dict is updated.
+        mesh: Mesh loaded by trimesh.
+        matrix: Matrix (4, 4) from the mesh's frame to the scene's.
+        path: Mesh file.
+        pictures: Textures converted so far, keyed by the `id` of their material. The dict is updated.
 
     Raises:
         InputError: A face is not a triangle of existing vertices.
@@ -220,7 +220,7 @@ def _unit(colours: Any) -> F32:
 
 
 def _material(material: Any, pictures: dict[int, U8]) -> tuple[U8 | None, Colour, float]:
-    """Return the RGBA texture of a material, the colour that multiplies the texture, and the opacity.
+    """Return a material's RGBA texture, the colour that multiplies the texture, and the opacity.
 
     A black material with a texture is treated as white, because some exporters write black for materials that consist
     only of a texture.
@@ -236,9 +236,9 @@ def _material(material: Any, pictures: dict[int, U8]) -> tuple[U8 | None, Colour
 
 
 def _opacity(fields: dict[str, Any]) -> float:
-    """Return the opacity of a material from an MTL file, which is `d` or 1 - `Tr`.
+    """Return the opacity of a material from an MTL file: `d`, or 1 - `Tr`.
 
-    The result is 1 if the opacity is missing, invalid or 0.
+    Returns 1 if the opacity is missing, invalid or 0.
     """
     for name, sign, start in (("d", 1.0, 0.0), ("tr", -1.0, 1.0)):
         try:

@@ -23,9 +23,9 @@ U32 = NDArray[np.uint32]
 
 @np.errstate(all="ignore")
 def load_compressed(header: PlyHeader) -> Gaussians:
-    """Read a compressed PLY file of SuperSplat.
+    """Read a PLY file compressed by SuperSplat.
 
-    The file stores numbers of 8 to 11 bits, which are fractions between the bounds of a chunk of splats. Raises
+    The file stores 8- to 11-bit numbers, each a fraction of the range between the bounds for a chunk of splats. Raises
     InputError if the file is damaged, bounds or harmonics are missing for some splats, or no splat is visible.
     """
     elements = read_elements(header)
@@ -37,7 +37,7 @@ def load_compressed(header: PlyHeader) -> Gaussians:
     place, turn, scale, colour = (splats[f"packed_{kind}"].astype(np.uint32) for kind in kinds)
 
     def bounds_of(name: str, axes: str) -> list[F32]:
-        """Return the lower bounds (n, 3) and the upper bounds (n, 3) of each splat's chunk."""
+        """Return two (n, 3) arrays: the lower and the upper bounds of each splat's chunk."""
         columns = [[f"{end}_{name}{axis}" for axis in axes] for end in ("min", "max")]
         if missing := {*columns[0], *columns[1]} - {*(bounds.dtype.names or ())}:
             raise InputError(header.path, "chunk", f"has no {min(missing)}")
@@ -68,7 +68,8 @@ def load_compressed(header: PlyHeader) -> Gaussians:
 def load_splat(path: Path) -> Gaussians:
     """Read a .splat file, which stores position, scale, RGBA colour and rotation in 32 bytes per splat.
 
-    Raises InputError if the file is empty, has a size that is not a multiple of 32 bytes, or contains no visible splat.
+    Raises InputError if the file is empty, has a size that is not a multiple of 32 bytes, or contains no visible
+    splats.
     """
     data = untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)
     if not data or len(data) % SPLAT.itemsize:
@@ -88,11 +89,11 @@ def load_splat(path: Path) -> Gaussians:
 
 
 def fields_of(packed: U32, bits: tuple[int, ...]) -> F32:
-    """Unpack the bit fields of words as fractions (n, len(bits)) of the largest value of each field.
+    """Unpack bit fields from words, as fractions (n, len(bits)) of each field's largest value.
 
     Args:
         packed: Words (n,).
-        bits: Width of each field in bits, from the highest field to the lowest.
+        bits: Width of each field in bits, highest field first.
     """
     parts = []
     for width in reversed(bits):
@@ -107,19 +108,19 @@ def _between(share: F32, low: F32, high: F32) -> F32:
 
 
 def _turns(packed: U32) -> F32:
-    """Decode quaternions (n, 4), ordered w, x, y, z, from packed words.
+    """Decode packed words (n,) into quaternions (n, 4) in w, x, y, z order.
 
-    The two highest bits of a word are the index of the largest component, which is not stored.
+    The top two bits of each word give the index of the largest component, which is not stored.
     """
     return with_largest((fields_of(packed, (10, 10, 10)) - np.float32(0.5)) * np.float32(np.sqrt(2)), packed >> 30)
 
 
 def with_largest(three: NDArray[np.floating[Any]], number: NDArray[np.integer[Any]]) -> F32:
-    """Return unit quaternions (n, 4), of which the largest component is computed from the other three.
+    """Return unit quaternions (n, 4), computing each one's largest component from the other three.
 
     Args:
-        three: Components (n, 3) of each quaternion, without the largest component.
-        number: Index (n,) at which the largest component is inserted. If an index is above 3, the quaternion is zero.
+        three: The components (n, 3) of each quaternion except the largest.
+        number: Index (n,) of each largest component. If an index is above 3, the quaternion is zero.
     """
     largest = np.sqrt(np.maximum(1 - (three**2).sum(1), 0))
     quaternions = np.zeros((len(three), 4), np.float32)

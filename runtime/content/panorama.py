@@ -1,4 +1,4 @@
-"""Crop equirectangular pictures of 360 or 180 degrees to the part that is straight ahead."""
+"""Crop 360- or 180-degree equirectangular pictures to the part that is straight ahead."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 
 from runtime.records import F32, U8
 
-AHEAD_DEG = 75.0  # horizontal field of view of the crop, slightly larger than that of a display
+AHEAD_DEG = 75.0  # the crop's horizontal field of view, slightly larger than a display's
 SHAPE = 16 / 9  # width over height of the crop
-ASPECT_OFF = 0.02  # relative tolerance for the aspect ratio of a view
+ASPECT_OFF = 0.02  # relative tolerance for a view's aspect ratio
 
 
 def is_around(width: float, height: float, span_deg: int) -> bool:
@@ -22,7 +22,7 @@ def is_around(width: float, height: float, span_deg: int) -> bool:
 def ahead(view: U8, span_deg: int) -> U8:
     """Return the middle of an equirectangular view (h, w, 3), reprojected to a pinhole camera.
 
-    The resolution is about that of the view.
+    The result has about the same resolution as the view.
     """
     u, v = _places(view.shape[1], view.shape[0], span_deg)
     return np.asarray(cv2.remap(view, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
@@ -30,7 +30,7 @@ def ahead(view: U8, span_deg: int) -> U8:
 
 @lru_cache(maxsize=2)
 def _places(width: int, height: int, span_deg: int) -> tuple[F32, F32]:
-    """Return the column and the row in the view that each pixel of the crop shows, as two arrays.
+    """Return, as two arrays, the view's column and row that each pixel of the crop shows.
 
     Pixel centres have integer coordinates, as OpenCV requires.
     """

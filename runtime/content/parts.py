@@ -1,4 +1,4 @@
-"""Parts, which are triangles with a common material, and merging of parts that have equal materials."""
+"""Parts (triangles that share a material), and a function that merges parts with equal materials."""
 
 from __future__ import annotations
 
@@ -14,44 +14,44 @@ from runtime.content.shapes import Shape, join
 from runtime.records import F32, U8
 
 BLACK: Colour = (0.0, 0.0, 0.0)
-UNCOLOURED: Colour = (0.70, 0.74, 0.80)  # colour of meshes from files without colours
-OPAQUE_FROM = 0.99  # alpha from which a pixel counts as opaque
+UNCOLOURED: Colour = (0.70, 0.74, 0.80)  # colour of meshes whose files contain no colours
+OPAQUE_FROM = 0.99  # a pixel with at least this alpha counts as opaque
 LARGEST_TEXTURE_PX = 4096
-OUTLINED_MAX = 200_000  # parts and files with more triangles get no outlines, which would cost more than drawing
+OUTLINED_MAX = 200_000  # parts and files with more triangles get no outlines, which would take longer than drawing
 Wrap = Literal["repeat", "clamp", "mirror"]
 
 
 @dataclass(frozen=True, slots=True)
 class Sampler:
-    """Settings with which a texture is sampled."""
+    """Texture sampling settings."""
 
-    wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")  # wrap modes across and down
+    wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")  # horizontal and vertical wrap modes
     nearest: bool = False  # True to magnify the texture without interpolation
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """Triangles with a common material, in a frame that `TriangleSource` places in the scene."""
+    """Triangles that share a material, in a frame that `TriangleSource` places in the scene."""
 
     shape: Shape
-    picture: U8 | None = None  # RGBA texture (h, w, 4) whose row 0 is at v = 0; parts may share an array
-    colour: Colour = WHITE  # factor on all colours, 0-1
+    picture: U8 | None = None  # RGBA texture (h, w, 4) with row 0 at v = 0; several parts may share an array
+    colour: Colour = WHITE  # multiplies all colours, 0-1
     vertex_colours: F32 | None = None  # RGB or RGBA colours (v, 3 or 4), 0-1
     lit: bool = True  # True if the lamp shades the part
     grey: bool = False  # True to draw the part without colour
-    turning: bool = False  # True if the part rotates, which requires a bounding box for every orientation
+    turning: bool = False  # True if the part rotates, so its bounding box must hold every orientation
     sampler: Sampler = Sampler()
     opacity: float = 1.0
     alpha: Literal["opaque", "mask", "blend"] = "mask"
-    cutoff: float = 0.5  # alpha below which a mask discards pixels
+    cutoff: float = 0.5  # a mask discards pixels whose alpha is below this
     two_sided: bool = True  # False to cull the back faces of a translucent part
     is_linear: bool = False  # True if colours (not pictures) are linear light and the shader computes in linear light
-    glow: Colour = BLACK  # emitted light (linear), which `glow_picture` modulates
+    glow: Colour = BLACK  # emitted light (linear), multiplied by `glow_picture`
     glow_picture: U8 | None = None  # RGBA texture (h, w, 4)
 
     @property
     def features(self) -> tuple[str, ...]:
-        """Names of the preprocessor symbols for which the part's shaders are compiled."""
+        """Names of the preprocessor symbols to define when compiling the part's shaders."""
         least = self.opacity
         if self.picture is not None:
             least *= float(self.picture[..., 3].min()) / 255
@@ -74,7 +74,7 @@ class Part:
 
 
 def texture_of(image: Any) -> U8:
-    """Convert a Pillow image to an RGBA array (h, w, 4), whose sides are reduced to the texture limit."""
+    """Convert a Pillow image to an RGBA array (h, w, 4), shrunk to the texture limit if it is larger."""
     if image.mode not in ("L", "RGB", "RGBA") or "transparency" in image.info:  # palette indices cannot be averaged
         image = image.convert("RGBA")
     image.thumbnail((LARGEST_TEXTURE_PX, LARGEST_TEXTURE_PX))
@@ -88,9 +88,9 @@ def coded(light: ArrayLike) -> F32:
 
 
 def merged(parts: Sequence[Part]) -> list[Part]:
-    """Merge parts whose materials are equal, into parts of at most `OUTLINED_MAX` triangles.
+    """Merge parts with equal materials into parts of at most `OUTLINED_MAX` triangles each.
 
-    The materials of merged parts may differ in colour and opacity, which become vertex colours.
+    Merged parts may differ in colour and opacity, which are turned into vertex colours.
     """
     alike: dict[tuple[object, ...], list[list[Part]]] = {}
     for part in parts:

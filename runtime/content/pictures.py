@@ -17,13 +17,13 @@ from runtime.records import U8
 
 
 def screen(stack: PanelStack, *, width_px: int, height_px: int, pixel_aspect: float = 1.0) -> PlaneRaster:
-    """Return the pixel grid of a picture on the plane x = 0, enlarged or reduced to fit the display.
+    """Return a picture's pixel grid on the plane x = 0, enlarged or reduced to fit the display.
 
     Args:
-        stack: Panels of the display.
-        width_px: Width of the picture.
-        height_px: Height of the picture.
-        pixel_aspect: Width of a pixel divided by its height.
+        stack: The display's panels.
+        width_px: Picture width.
+        height_px: Picture height.
+        pixel_aspect: Pixel width divided by pixel height.
     """
     pitch_m = min(stack.width_m / (width_px * pixel_aspect), stack.height_m / height_px)
     return PlaneRaster(
@@ -44,7 +44,7 @@ def prepare(file: SceneFile) -> Callable[..., ContentSource]:
     """
     frames = open_frames(file.path, file.settings)
     make = partial(PicturesSource, frames, file=file)
-    make()  # reports now if the first picture is too small for its layout
+    make()  # raises now if the first picture is too small for its layout
     return make
 
 
@@ -82,7 +82,7 @@ class PicturesSource(ContentSource):
         return self._shown[which].warped(matrix, view)
 
     def _take(self, number: int, picture: U8) -> None:
-        """Split a picture into the views that are shown from now on.
+        """Split a picture into views, and show these from now on.
 
         Raises ValueError if the picture is too small for its layout.
         """
@@ -92,12 +92,12 @@ class PicturesSource(ContentSource):
         aspect = layout.pixel_aspect(width_px=width, height_px=height)
         self._screen = screen(self._file.stack, width_px=width, height_px=height, pixel_aspect=aspect)
         self._shown: dict[int, WarpedPicture] = {}
-        self._views, self._at = views, number  # `_at` is the number of the picture
+        self._views, self._at = views, number  # `_at` is the picture's number
 
     def _view_for(self, view: View) -> int:
         """Return the index of the view that an eye sees.
 
-        The eye's side determines the view of a stereo picture, and the eye's angle determines the view of a quilt.
+        For a stereo picture, the eye's side determines the view. For a quilt, the eye's angle does.
         """
         if len(self._views) <= 2:
             return min(view.side, len(self._views) - 1)

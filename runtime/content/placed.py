@@ -1,7 +1,7 @@
-"""Shift, rotate and scale the scene of any source, by transforming the eye in the opposite direction.
+"""Shift, rotate and scale any source's scene, by applying the opposite transformation to the eye.
 
 The source need not support placement. The view's projection multiplied by the placement is simply another projection,
-for an eye whose position is given in the frame of the scene.
+for an eye whose position is given in the scene's frame.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ NS_PER_MIN = 60 * NS_PER_S
 
 @dataclass(frozen=True, slots=True)
 class Placing:
-    """Placement of a scene, p_stack = offset + scale · R · p_scene.
+    """A scene's placement: p_stack = offset + scale · R · p_scene.
 
-    The rotation R is `rotation_deg`, followed by the current rotation of the turntable.
+    The rotation R is `rotation_deg`, followed by the turntable's current rotation.
     """
 
     scale: float = 1.0
@@ -34,14 +34,14 @@ class Placing:
     turntable_per_min: float = 0.0  # revolutions about the vertical axis
 
     def rotation(self, time_ns: int) -> F64:
-        """Return the 3x3 rotation from the scene's frame to `stack` at a time."""
-        # Whole revolutions are removed first, which keeps precision on a clock that has run for months.
+        """Return the 3x3 rotation from the scene's frame to `stack` at a given time."""
+        # Whole revolutions are removed first, to keep precision on a clock that has run for months.
         period_ns = NS_PER_MIN / self.turntable_per_min if self.turntable_per_min else np.inf
         turntable = rotation_matrix((0.0, 0.0, 360.0 * (time_ns % period_ns) / period_ns), "xyz")
         return turntable @ rotation_matrix(self.rotation_deg, "xyz")
 
     def stack_from_scene(self, time_ns: int) -> F64:
-        """Return the 4x4 similarity from the scene's frame to `stack` at a time."""
+        """Return the 4x4 similarity from the scene's frame to `stack` at a given time."""
         matrix = np.eye(4)
         matrix[:3, :3] = self.scale * self.rotation(time_ns)
         matrix[:3, 3] = self.offset_m
@@ -49,12 +49,12 @@ class Placing:
 
 
 def placing_of(settings: ContentSettings) -> Placing:
-    """Return the placement that the settings specify."""
+    """Return the placement specified by the settings."""
     return Placing(settings.scale, settings.offset_m, settings.rotation_deg, settings.turntable_per_min)
 
 
 def placed_source(source: ContentSource, placing: Placing) -> ContentSource:
-    """Return a source that shows `source` with a placement, which replaces any earlier placement."""
+    """Return a source that shows `source` with a placement that replaces any earlier one."""
     if isinstance(source, PlacedSource):
         source = source.source
     return source if placing == Placing() else PlacedSource(source, placing)
@@ -69,7 +69,7 @@ class PlacedSource(ForwardingSource):
 
     @property
     def info(self) -> ContentInfo:  # type: ignore[override]
-        """Properties of the placed scene, some of which differ from those of the original scene."""
+        """The placed scene's properties. Some differ from the original scene's."""
         return _moved(self.source.info, self.placing)
 
     def forwarded(self, view: View, time_ns: int) -> tuple[ContentSource, View, int]:
@@ -97,6 +97,6 @@ class PlacedSource(ForwardingSource):
 
 def _moved(info: ContentInfo, placing: Placing) -> ContentInfo:
     still = not placing.turntable_per_min
-    # A flat scene stays flat only if its plane remains that of the middle panel.
+    # A flat scene stays flat only if it remains in the middle panel's plane.
     is_flat = still and placing.rotation_deg[1:] == (0.0, 0.0) and placing.offset_m[0] == 0.0
     return replace(info, moving=info.moving or not still, flat_x_m=info.flat_x_m if is_flat else None)

@@ -1,4 +1,4 @@
-"""Map the coordinates of scene files to the stack frame, with presets or by fitting to the display."""
+"""Map scene file coordinates to the stack frame, using presets or by fitting to the display."""
 
 from __future__ import annotations
 
@@ -15,40 +15,41 @@ from runtime.records import F64
 
 log = logging.getLogger("phasestack.content")
 
-FILL = 0.75  # largest width and height of a fitted scene relative to the display, as its front appears larger
-DEEPER = 2.0  # largest depth of a fitted scene relative to the range `depth_m`
-BACK = 0.5  # component of the mean normal away from the viewer above which a flat mesh is turned around
-FLAT = 0.1  # thickness relative to the other sides below which a mesh is flat
-STANDS = 0.2  # difference in where the y and z ranges begin, relative to their sizes, that identifies the up axis
+FILL = 0.75  # largest share of the display's width and height for a fitted scene, as its front appears larger
+DEEPER = 2.0  # largest depth of a fitted scene, as a multiple of the range `depth_m`
+BACK = 0.5  # a flat mesh is turned around if its mean normal's component away from the viewer exceeds this
+FLAT = 0.1  # a mesh is flat if its thickness, divided by its second smallest side, is below this
+STANDS = 0.2  # the y and z ranges, relative to their sizes, must begin this far apart to identify the up axis
 GLTF = (".glb", ".gltf")
 CUSTOMS = {".glb": ("+y", "+z"), ".gltf": ("+y", "+z"), ".obj": ("+y", "+z"), ".stl": ("+z", "-y")}  # up, to viewer
-DARK = (0.12, 0.12, 0.12)  # default background of files, on which both brighter and darker ghosts are visible
+DARK = (0.12, 0.12, 0.12)  # default background for files; both brighter and darker ghosts are visible against it
 
 
 @dataclass(frozen=True, slots=True)
 class SceneFile:
-    """File of a scene, with the settings and the display that determine where its content is placed."""
+    """A scene file, with the settings and the display that determine where its content is placed."""
 
     path: Path
     settings: ContentSettings
     stack: PanelStack
-    preset: str = ""  # name of the preset for the file, or an empty string
+    preset: str = ""  # name of the file's preset, or an empty string
 
     @property
     def background(self) -> tuple[float, float, float]:
-        """Colour of the background, which is dark unless the settings specify another colour."""
+        """Background colour: dark, unless the settings specify another colour."""
         return self.settings.background or DARK
 
     def placed(self, low: F64, high: F64, *, custom: tuple[str, str] | None = None, facing: F64 | None = None) -> F64:
-        """Return the 4x4 matrix stack_from_scene for the content of the file.
+        """Return the 4x4 stack_from_scene matrix for the file's content.
 
-        The preset determines the matrix if there is one. Otherwise, the content is fitted to the display or, depending
-        on the settings, its coordinates are used as metres without scaling.
+        If there is a preset, it determines the matrix. Otherwise, depending on the settings, the content is either
+        fitted to the display or left unscaled, with its coordinates taken as metres.
 
         Args:
-            low: Lowest corner (3,) of the content.
-            high: Highest corner (3,) of the content.
-            custom: Usual axes (up, towards the viewer) of the file's format. The default depends on the file's suffix.
+            low: The content's lowest corner (3,).
+            high: The content's highest corner (3,).
+            custom: Axes (up, towards the viewer) that are usual for the file's format. By default, they depend on the
+                file's suffix.
             facing: Area-weighted mean normal (3,) of the surface. If given, a flat mesh is turned to face the viewer.
         """
         if self.preset:
@@ -61,7 +62,7 @@ class SceneFile:
         return matrix
 
     def _axes(self, low: F64, high: F64, custom: tuple[str, str] | None, facing: F64 | None) -> F64:
-        """Return the 3x3 rotation scene_from_stack from the settings, the file's format, or a guess."""
+        """Return the 3x3 scene_from_stack rotation, based on the settings, the file's format, or a guess."""
         if self.settings.axes != "auto":
             up, out = self.settings.axes.split()
         elif not self.settings.fit and self.path.suffix.lower() not in GLTF:
@@ -75,31 +76,31 @@ class SceneFile:
 
 
 def guessed_axes(low: F64, high: F64) -> tuple[str, str]:
-    """Guess the axes (up, towards the viewer) of content, which are either (+y, +z) or (+z, -y).
+    """Guess the content's axes (up, towards the viewer): either (+y, +z) or (+z, -y).
 
-    Objects often stand on the ground at height 0. If only one of the y and z ranges begins near 0 or above, the
-    corresponding axis is up. Otherwise, the longer axis is up.
+    Objects often stand on the ground at height 0. If only one of the y and z ranges begins near 0 or above, that axis
+    is taken to be up. Otherwise, the longer axis is.
 
     Args:
-        low: Lowest corner (3,) of the content.
-        high: Highest corner (3,) of the content.
+        low: The content's lowest corner (3,).
+        high: The content's highest corner (3,).
     """
     size = np.maximum(high - low, 1e-30)
-    y, z = np.maximum(low / size + 0.5, 0.0)[1:]  # 0 if centred on the origin, 0.5 if beginning at the origin
+    y, z = np.maximum(low / size + 0.5, 0.0)[1:]  # 0 if centred on the origin, 0.5 if it begins there
     z_is_up = z > y if abs(z - y) > STANDS else size[2] > size[1]
     return ("+z", "-y") if z_is_up else ("+y", "+z")
 
 
 def turned_to_viewer(up: str, out: str, *, size: F64, facing: F64) -> tuple[str, str]:
-    """Change the axes of a flat mesh to those with which its front faces the viewer.
+    """Choose the axes of a flat mesh so that its front faces the viewer.
 
-    A mesh that is flat along the up axis is shown as seen from above, with its near edge at the bottom. The axes of
-    other meshes are returned unchanged.
+    A mesh that is flat along the up axis is shown from above, with its near edge at the bottom. If a mesh is not flat,
+    its axes are returned unchanged.
 
     Args:
         up: Axis that points up.
         out: Axis that points towards the viewer.
-        size: Size (3,) of the bounding box.
+        size: Bounding box size (3,).
         facing: Area-weighted mean normal (3,) of the surface.
 
     Returns:
@@ -122,17 +123,17 @@ def _opposite(axis: str) -> str:
 
 
 def fitted(low: F64, high: F64, *, axes: F64, stack: PanelStack, depth_m: tuple[float, float]) -> F64:
-    """Return the 4x4 matrix stack_from_scene that fits a box to the display's size and depth.
+    """Return the 4x4 stack_from_scene matrix that fits a box to the display's size and depth.
 
-    The box is scaled and centred. A scene deeper than the range `depth_m` begins at the front of the range and extends
-    beyond its rear, where most of the scene is hidden.
+    The box is scaled and centred. If the scene is deeper than the range `depth_m`, it begins at the front of the range
+    and extends beyond the rear, where it is mostly hidden.
 
     Args:
-        low: Lowest corner (3,) of the box, in the frame of the scene.
-        high: Highest corner (3,) of the box, in the frame of the scene.
-        axes: Rotation (3, 3) scene_from_stack.
-        stack: Panels of the display.
-        depth_m: Range (rear, front) of x in which content is placed.
+        low: Lowest corner (3,) of the box, in the scene's frame.
+        high: Highest corner (3,) of the box, in the scene's frame.
+        axes: The scene_from_stack rotation (3, 3).
+        stack: The display's panels.
+        depth_m: Range of x (rear, front) to place content in.
     """
     size = np.abs(axes.T @ (high - low))
     room = np.array([DEEPER * (depth_m[1] - depth_m[0]), stack.width_m * FILL, stack.height_m * FILL])

@@ -1,7 +1,7 @@
 """Play a list of scenes one after another, each with a duration and settings.
 
-All scenes are loaded before the first scene is shown. Missing files are therefore reported at the start, and changing
-to the next scene takes no time.
+All scenes are loaded before the first one is shown, so missing files are reported at the start, and changing to the
+next scene takes no time.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from runtime.support.picture_header import CAMERA_SET
 from runtime.support.plausible import within
 from runtime.support.plugins import located
 
-ENTRIES_MAX = 64  # largest number of entries, all of which are kept in memory
+ENTRIES_MAX = 64  # largest number of entries; all are kept in memory
 
 
 class PlaylistFile(Section):
-    """Contents of a playlist file in TOML or JSON, with a table `[[show]]` for each scene."""
+    """Contents of a TOML or JSON playlist file, with a `[[show]]` table for each scene."""
 
     repeat: bool = Field(True, description="restart after the last scene; false: keep showing it")
     show: list[dict[str, Any]] = Field(min_length=1, max_length=ENTRIES_MAX, description="the scenes, in order")
 
 
 class Entry(ContentSettings):
-    """Scene of a playlist, with the settings and the placement that apply to this scene."""
+    """A scene in a playlist, with the settings and placement that apply to it."""
 
     scene: str = Field(min_length=1, description="like content.scene; paths are relative to the playlist's folder")
     seconds: Annotated[float, within(0.5, 86_400.0, "s")] = Field(description="how long it is shown")
@@ -49,7 +49,7 @@ class Entry(ContentSettings):
 
 @dataclass(frozen=True, slots=True)
 class Playlist:
-    """Validated playlist, whose scenes have not been opened."""
+    """A validated playlist. Its scenes have not been opened yet."""
 
     path: Path
     repeat: bool
@@ -95,7 +95,7 @@ class PlaylistSource(ForwardingSource):
 
         Args:
             playlist: Playlist to show.
-            openers: Function for each entry that creates its source, given `context`.
+            openers: For each entry, a function that creates its source, given `context`.
             context: Current moderngl context.
 
         Raises:
@@ -118,7 +118,7 @@ class PlaylistSource(ForwardingSource):
 
     @property
     def info(self) -> ContentInfo:  # type: ignore[override]
-        """Properties of the current scene, with a name that begins with the playlist's name."""
+        """The current scene's properties, with the playlist's name put before the scene's."""
         index, inner = self._number % len(self._sources), self.source.info
         name = f"{self._list.path.stem}: {inner.name} ({index + 1} of {len(self._sources)})"
         return replace(inner, name=name, moving=True)
@@ -128,10 +128,10 @@ class PlaylistSource(ForwardingSource):
         return self._sources[self._number % len(self._sources)]
 
     def describe(self, *, time_ns: int) -> dict[str, Any]:
-        """Return the status of the playlist.
+        """Return the playlist's status.
 
-        Its keys are `entries` (scenes and durations), `index` (current entry) and `left_s` (remaining time of the
-        current scene, or None if the scene stays).
+        The keys are `entries` (scenes and durations), `index` (current entry) and `left_s` (time left for the current
+        scene, or None if it stays).
         """
         entries = [{"scene": entry.scene, "seconds": entry.seconds} for entry in self._list.entries]
         index, since_ns = self._at(time_ns)
@@ -160,14 +160,14 @@ class PlaylistSource(ForwardingSource):
             source.close()
 
     def _turn_to(self, time_ns: int) -> int:
-        """Switch to the entry that is due at a time, and return how long the entry has been due, in ns."""
+        """Switch to the entry due at a given time, and return how long it has been due, in ns."""
         if self._begin_ns is None:
             self._begin_ns = time_ns
         self._number, since_ns = self._at(time_ns)
         return since_ns
 
     def _at(self, time_ns: int) -> tuple[int, int]:
-        """Return the number of the entry at a time, and how long the entry has been due, in ns.
+        """Return the number of the entry due at a given time, and how long it has been due, in ns.
 
         Entries are counted across repetitions of the playlist.
         """

@@ -1,4 +1,4 @@
-"""Read the headers of PLY files, and read elements of binary files as structured arrays.
+"""Read PLY headers, and read the elements in binary PLY files as structured arrays.
 
 No existing library is suitable: plyfile is licensed under the GPL, and trimesh returns only the properties it knows.
 """
@@ -25,7 +25,7 @@ TYPES = {
     "double": "f8", "float64": "f8",
 }  # fmt: skip
 ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
-PACKED = "packed_position"  # property that marks SuperSplat's compressed splats
+PACKED = "packed_position"  # property that identifies SuperSplat's compressed splats
 SPLAT_MARKS = {"f_dc_0", "scale_0", "rot_0", PACKED}
 
 
@@ -35,14 +35,14 @@ class PlyHeader:
 
     path: Path
     order: str  # byte order of the elements, or `ascii`; a key of ORDERS
-    counts: dict[str, int]  # number of elements of each kind, in the order in which they are stored
-    properties: dict[str, list[tuple[str, str]]]  # (name, type) of the properties of each kind; a type may be `list`
-    starts_at: int  # offset of the first element in bytes
-    size: int  # size of the file in bytes
+    counts: dict[str, int]  # number of elements of each kind, in the order they are stored in
+    properties: dict[str, list[tuple[str, str]]]  # (name, type) of each kind's properties; a type may be `list`
+    starts_at: int  # byte offset of the first element
+    size: int  # file size in bytes
 
     @property
     def kind(self) -> str:
-        """Kind of content, `splats` or `triangles`, which determines the limits for the file."""
+        """Kind of content (`splats` or `triangles`), which determines the limits for the file."""
         return "splats" if SPLAT_MARKS & {name for name, _ in self.properties["vertex"]} else "triangles"
 
     @property
@@ -52,10 +52,10 @@ class PlyHeader:
 
 
 def read_header(path: Path) -> PlyHeader:
-    """Read the header of a PLY file.
+    """Read a PLY file's header.
 
-    Raises InputError if the header is missing, incomplete or not understood, or if a number of elements exceeds a limit
-    or the file's size.
+    Raises InputError if the header is missing, incomplete or not understood, or if an element count exceeds a limit or
+    the file's size.
     """
     with untrusted_input.open_regular(path, most_bytes=LIMITS.file_bytes) as file:
         head = file.read(LONGEST_HEADER)
@@ -93,10 +93,10 @@ def read_header(path: Path) -> PlyHeader:
 
 
 def read_elements(header: PlyHeader) -> dict[str, Table]:
-    """Read the elements of a binary PLY file as structured arrays, by name.
+    """Read the elements in a binary PLY file as structured arrays, keyed by name.
 
-    Reading ends at the first kind of element that has a list property. Raises InputError if the file is cut off or in
-    text form, or if the vertices have not been read by then.
+    Reading stops at the first kind of element with a list property. Raises InputError if the file is cut off or in text
+    form, or if the vertices have not been read by then.
     """
     path, place, found = header.path, header.starts_at, dict[str, Table]()
     if header.order == "ascii":

@@ -1,4 +1,4 @@
-"""Scale and pose of the EyeReal paper's 17 scenes, from its supplement and from its published code."""
+"""Scale and pose of the EyeReal paper's 17 scenes, from its supplement and its published code."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Triple = tuple[float, float, float]
 
 @cache
 def preset_file() -> dict[str, Any]:
-    """Return the contents of presets.toml. Comments in the file explain the keys."""
+    """Return the contents of presets.toml. The keys are explained by comments in the file."""
     return tomllib.loads(FILE.read_text(encoding="utf-8"))
 
 
@@ -30,7 +30,7 @@ def preset_names() -> tuple[str, ...]:
 
 
 def stack_from_preset(name: str) -> F64:
-    """Return the 4x4 map from scene units to metres in `stack`, as the supplement specifies it.
+    """Return the 4x4 map from scene units to metres in `stack`, as specified in the supplement.
 
     The map is R · p / (100 r_p2d) + t, where r_p2d is the scale in scene units per centimetre.
     """
@@ -42,10 +42,10 @@ def stack_from_preset(name: str) -> F64:
 
 
 def drawn_scene_from_stack(name: str) -> F64:
-    """Return the 4x4 map from metres in `stack` to scene units, as the published code drew the data set.
+    """Return the 4x4 map from metres in `stack` to scene units, as used by the published code.
 
-    This code uses different scales than the supplement, aligns the panels with the scene's axes, and places the panels
-    differently for evaluation.
+    The data set was drawn with this code. Its scales differ from the supplement's. It also aligns the panels with the
+    scene's axes, and places them differently for evaluation.
     """
     code, matrix = preset_file()["scene"][name]["published"], np.eye(4)
     axes = axes_matrix(out=code["out"], up=code["up"])
@@ -58,7 +58,7 @@ def drawn_scene_from_stack(name: str) -> F64:
 
 
 def rotation_matrix(angles_deg: Triple, order: str) -> F64:
-    """Return the 3x3 rotation about the axes x, y and z by the given angles.
+    """Return the 3x3 rotation by the given angles about the x, y and z axes.
 
     Args:
         angles_deg: Angles about x, y and z.
@@ -69,9 +69,9 @@ def rotation_matrix(angles_deg: Triple, order: str) -> F64:
 
 
 def axes_matrix(*, out: str, up: str) -> F64:
-    """Return the 3x3 rotation scene_from_stack, given two axes of the scene, such as `+z`.
+    """Return the 3x3 scene_from_stack rotation, given two of the scene's axes, such as `+z`.
 
-    The columns are the scene's directions out of the screen, to the right and up.
+    The columns are the directions out of the screen, to the right and up, in the scene's frame.
 
     Args:
         out: Axis that points out of the screen.

@@ -16,11 +16,11 @@ from runtime.content.triangles import DrawnPart, TriangleSource
 from runtime.optics.stack import PanelStack
 from runtime.records import F64
 
-MODELLED_HEIGHT_M = 0.2916  # height of the display for which the scenes' lengths are given
+MODELLED_HEIGHT_M = 0.2916  # display height that the scenes' lengths are meant for
 
 
 def parts_of(built_in: Scene) -> list[DrawnPart]:
-    """Prepare the parts of a scene, one for each object.
+    """Prepare a scene's parts, one per object.
 
     This is the slower half of opening a scene. It needs no GL context and may run on any thread.
     """
@@ -41,7 +41,7 @@ def parts_of(built_in: Scene) -> list[DrawnPart]:
 
 
 class ProceduralSource(TriangleSource):
-    """Source of a built-in scene, scaled to the display's height."""
+    """Source that draws a built-in scene, scaled to the display's height."""
 
     def __init__(
         self,
@@ -55,11 +55,11 @@ class ProceduralSource(TriangleSource):
         """Create the source.
 
         Args:
-            built_in: Scene, or its name.
-            stack: Panels of the display, to whose height the scene is scaled.
+            built_in: Scene or scene name.
+            stack: The display's panels. The scene is scaled to their height.
             context: Current moderngl context.
-            background: Colour of the background. The scene determines it by default.
-            parts: Result of `parts_of` for the scene, if it has been prepared on another thread.
+            background: Background colour, by default the scene's.
+            parts: Parts that `parts_of` returned for the scene, if they were prepared on another thread.
         """
         self._scene = SCENES[built_in]() if isinstance(built_in, str) else built_in
         self._scale = stack.height_m / MODELLED_HEIGHT_M
@@ -80,7 +80,7 @@ class ProceduralSource(TriangleSource):
         return [self._placed(thing, time_ns / NS_PER_S) for thing in self._scene.things]
 
     def _placed(self, thing: Thing, time_s: float) -> F64:
-        """Return the 4x4 matrix that places an object in frame `stack` at a time."""
+        """Return the 4x4 matrix that places an object in frame `stack` at a given time."""
         turn = np.eye(3) if thing.rotation is None else thing.rotation
         if self._scene.moving and thing.turns_per_s:
             turn = shapes.rotation_about(2, 2 * np.pi * thing.turns_per_s * time_s) @ turn

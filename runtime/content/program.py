@@ -1,4 +1,4 @@
-"""Show pictures that another program, such as a renderer, a game or a web page, draws on request.
+"""Show pictures drawn on request by another program, such as a renderer, a game or a web page.
 
 docs/programs.md describes the protocol. If an answer is late or missing, the last pictures stay on the display.
 """
@@ -35,17 +35,17 @@ from runtime.support.background import begin
 log = logging.getLogger("phasestack.content")
 
 HOST = "127.0.0.1"
-ANSWERED_S = 0.4  # time limit for both pictures of a frame
-GIVEN_UP_S = 2.0  # time after which an unanswered frame is abandoned
-IN_FLIGHT_MAX = 2  # largest number of frames that have been requested but not answered
+ANSWERED_S = 0.4  # time limit for both of a frame's pictures
+GIVEN_UP_S = 2.0  # an unanswered frame is abandoned after this time
+IN_FLIGHT_MAX = 2  # largest number of frames requested but not yet answered
 HELLO_S = 5.0  # time limit for a program's greeting
 NEAR_M, FAR_M = 0.05, 100.0
-HEAD = struct.Struct("<II")  # header of an answer: frame number and side (0 left, 1 right)
+HEAD = struct.Struct("<II")  # an answer's header: frame number and side (0 left, 1 right)
 SIDES = ("left", "right")
 
 
 class ProgramOptions(Section):
-    """Options for the scene `program` in [content.options]."""
+    """Options in [content.options] for the scene `program`."""
 
     port: int = Field(0, ge=0, le=65535, description="TCP port to listen on; 0: any free port")
 
@@ -62,10 +62,10 @@ def prepare(file: SceneFile) -> Callable[[Any], ContentSource]:
 
 
 def camera_of(view: View) -> dict[str, Any]:
-    """Return the description of a view that is sent to programs.
+    """Describe a view, in the form sent to programs.
 
-    It contains the side and position of the eye, and the view and projection matrices for OpenGL, as lists in
-    column-major order. Lengths are in metres, and depth is in [-1, 1].
+    The description contains the eye's side and position, and the view and projection matrices for OpenGL as
+    column-major lists. Lengths are in metres, and depth is in [-1, 1].
     """
     pixels = view.pixels_from_stack
     forward = pixels[2, :3] / np.linalg.norm(pixels[2, :3])
@@ -87,11 +87,11 @@ def camera_of(view: View) -> dict[str, Any]:
 
 @dataclass(slots=True)
 class _Frame:
-    """Frame that has been requested from a program, with the pictures received so far."""
+    """A frame requested from a program, with the pictures received so far."""
 
     views: Sequence[View]
-    asked_s: float  # time of the request on the monotonic clock
-    pictures: dict[int, U8] = field(default_factory=dict)  # received pictures by side
+    asked_s: float  # request time on the monotonic clock
+    pictures: dict[int, U8] = field(default_factory=dict)  # received pictures, keyed by side
     awaited: bool = True  # True if `answer` may still be called for the frame
 
     @property
@@ -100,10 +100,10 @@ class _Frame:
 
 
 class Programs:
-    """Server to which drawing programs connect, to receive requests and to send pictures.
+    """Server that drawing programs connect to in order to receive requests and send pictures.
 
-    The program that connected last draws. Programs that only listen receive the same requests. All methods are
-    thread-safe.
+    The program that connected last does the drawing. Programs that only listen receive the same requests. All methods
+    are thread-safe.
     """
 
     def __init__(self, port: int, *, most_bytes: int) -> None:
@@ -111,19 +111,19 @@ class Programs:
 
         Args:
             port: TCP port, or 0 for any free port.
-            most_bytes: Largest size of a message that is accepted.
+            most_bytes: Largest message size to accept.
 
         Raises:
             InputError: The port cannot be opened.
         """
         self._token = secrets.token_urlsafe(24)
         self._changed = threading.Condition()
-        self._drawing: ServerConnection | None = None  # most recent connection of a program that draws
+        self._drawing: ServerConnection | None = None  # connection to the latest drawing program
         self._listening: set[ServerConnection] = set()
-        self._frames: dict[int, _Frame] = {}  # requested frames, by number
+        self._frames: dict[int, _Frame] = {}  # requested frames, keyed by number
         self._count, self._bottom_up = 0, False
         self.problem = ""
-        self.frame_ms: float | None = None  # time from a recent request to the last picture of the answer
+        self.frame_ms: float | None = None  # time from a recent request to the last picture in the answer
         try:
             self._server = serve(
                 self._connected, HOST, port, process_request=self._refused, max_size=most_bytes, compression=None
@@ -137,7 +137,7 @@ class Programs:
         log.info("waiting for a program; its address is in `phasestack status` (program)")
 
     def ask(self, views: Sequence[View], *, time_ns: int) -> int:
-        """Request the pictures of a frame, and return the frame's number.
+        """Request a frame's pictures, and return the frame's number.
 
         Args:
             views: Views to draw, all of the same size.
@@ -167,7 +167,7 @@ class Programs:
         return number
 
     def answer(self, number: int, side: int) -> U8:
-        """Wait for one picture of a frame, and return the picture.
+        """Wait for one of a frame's pictures, and return it.
 
         Raises ContentFailure if the picture does not arrive in time or the program disconnects.
         """
@@ -181,9 +181,9 @@ class Programs:
         raise ContentFailure(self.problem or f"the program has not answered within {1e3 * ANSWERED_S:.0f} ms")
 
     def done(self, number: int) -> None:
-        """Declare that no more pictures of a frame are needed.
+        """Declare that no more of a frame's pictures are needed.
 
-        The frame counts as in flight until it is answered or abandoned.
+        The frame still counts as in flight until it is answered or abandoned.
         """
         with self._changed:
             frame = self._frames.get(number)
@@ -205,7 +205,7 @@ class Programs:
     def _connected(self, connection: ServerConnection) -> None:
         """Serve a connection on the connection's thread.
 
-        The first message of a program states whether the program draws or only listens.
+        A program's first message states whether it draws or only listens.
         """
         why = "it closed the connection"
         try:
@@ -265,12 +265,12 @@ class Programs:
 
 
 class ProgramSource(ContentSource):
-    """Source that shows pictures that a connected program draws for the requested eye positions."""
+    """Source that shows pictures drawn by a connected program for the requested eye positions."""
 
     def __init__(self, programs: Programs, *, background: Any) -> None:
         self._programs = programs
         self.info = ContentInfo("program", moving=True, background=background)
-        self._expected: tuple[int, list[View]] | None = None  # number and views of the frame that has been requested
+        self._expected: tuple[int, list[View]] | None = None  # number and views of the requested frame
         weakref.finalize(self, programs.close)
 
     @property

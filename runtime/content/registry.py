@@ -1,4 +1,4 @@
-"""Open the content source that the setting `content.scene` specifies. Readers are imported on demand."""
+"""Open the content source specified by the setting `content.scene`. Readers are imported on demand."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ MESHES = (".glb", ".gltf", ".obj", ".off", ".stl")
 SPLATS = (".ply", ".splat", ".spz", ".sog")  # a .ply may be a mesh
 PLAYLISTS = (".toml", ".json")
 HARMLESS = {".png": PNG, ".jpg": JPEG, ".jpeg": JPEG}  # first bytes of stills that are read without a child process
-HARMLESS_PX = 4096 * 4096  # most pixels of such a still
+HARMLESS_PX = 4096 * 4096  # most pixels in such a still
 TO_GLTF, TO_PLY = "export it as glTF (.glb), as Blender does", "save it as PLY, as CloudCompare does"
 TO_SPLATS = "convert it: `npx @playcanvas/splat-transform in{} out.ply`"
 FILMS = (".wmv", ".flv", ".mpg", ".mpeg", ".ts", ".m2ts", ".mts", ".3gp", ".ogv", ".vob")
-OTHER_FILES = {  # kind of file and remedy, by the suffix of unsupported files
+OTHER_FILES = {  # kind of file and remedy, keyed by the suffix of unsupported files
     **dict.fromkeys((".fbx", ".dae", ".blend", ".3ds", ".x3d", ".wrl", ".abc"), ("a 3D scene", TO_GLTF)),
     **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), ("a USD scene", TO_GLTF)),
     **dict.fromkeys(
@@ -46,17 +46,17 @@ OTHER_FILES = {  # kind of file and remedy, by the suffix of unsupported files
     **dict.fromkeys((".ksplat", ".lcc"), ("compressed splats", TO_SPLATS)),
 }
 LFS = b"version https://git-lfs"
-TRIED_PX = (32, 18)  # size of the trial picture of a user-defined scene
+TRIED_PX = (32, 18)  # size of the trial picture drawn with a user-defined scene
 Opener = Callable[..., ContentSource]  # creates a source, given the keyword argument `context`
 
 
 def open_content(settings: ContentSettings, stack: PanelStack, context: Any) -> ContentSource:
-    """Open the scene that the settings specify: a built-in scene, a preset, a class, a file or a folder.
+    """Open the scene specified by the settings: a built-in scene, a preset, a class, a file or a folder.
 
     Args:
-        settings: Settings of the content.
-        stack: Panels of the display.
-        context: Current moderngl context of the thread that will use the source.
+        settings: Content settings.
+        stack: The display's panels.
+        context: Current moderngl context on the thread that will use the source.
 
     Raises:
         InputError: The scene cannot be shown. The message names the file and the field.
@@ -65,11 +65,11 @@ def open_content(settings: ContentSettings, stack: PanelStack, context: Any) -> 
 
 
 def prepare_content(settings: ContentSettings, stack: PanelStack) -> Opener:
-    """Read and check the scene that the settings specify, and return a function that creates the source.
+    """Read and check the scene specified by the settings, and return a function that creates the source.
 
     Preparation is slow, but needs no GL context and may run on any thread. Files are read in a child process, except
-    for small pictures. The progress is reported to `support.progress`. The returned function must be called on the
-    thread of the GL context.
+    for small pictures. Progress is reported through `support.progress`. The returned function must be called on the GL
+    context's thread.
 
     Raises:
         InputError: The scene cannot be shown or takes too long to load. The message names the file and the field.
@@ -131,7 +131,7 @@ def _from_path(file: SceneFile) -> Opener:
 
 
 def _is_harmless(file: SceneFile) -> bool:
-    """Return True if a file's header shows that decoding the file is quick and needs little memory."""
+    """Return True if a file's header shows that the file is quick to decode and needs little memory."""
     from runtime.content.layout import layout_of
 
     mark = HARMLESS.get(file.path.suffix.lower())
@@ -147,7 +147,7 @@ def _is_harmless(file: SceneFile) -> bool:
 def _read(file: SceneFile) -> Opener:
     """Read a file or folder with the reader for its suffix and contents.
 
-    The returned function can be pickled, so a child process can read the file.
+    The returned function can be pickled, so the file can be read in a child process.
     """
     path = file.path
     suffix = path.suffix.lower()
@@ -201,7 +201,7 @@ def _playlist(file: SceneFile) -> Opener:
 
 
 def _plugin(name: str, file: SceneFile) -> Opener:
-    """Import the class of a user-defined scene, and return a function that creates the source.
+    """Import a user-defined scene's class, and return a function that creates the source.
 
     The returned function draws a trial picture, and raises InputError if the picture or the source is faulty. Raises
     InputError if the class cannot be imported or the options are invalid.

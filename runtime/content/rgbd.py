@@ -1,8 +1,8 @@
 """Draw a picture with depth (colour and a grey depth map, side by side) as two surfaces.
 
-The front surface shows the picture. It is split where the depth jumps, because the foreground would be stretched there.
-The second surface fills the hole that a viewer would see by looking past such an edge. It shows background that is
-invented from depths and colours next to the edge.
+The front surface shows the picture. It is split wherever the depth jumps, because otherwise the foreground would be
+stretched there. The second surface fills the hole that a viewer would see when looking past such an edge. It shows a
+background invented from the depths and colours next to the edge.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8
 
-COLUMNS = 320  # resolution of smooth areas, as fine as that of depth cameras and fast without a GPU
-FINEST_COLUMNS = 1600  # largest resolution at edges
-NOMINAL_DISTANCE_M = 0.6  # distance from which the surface looks exactly like the picture
-TORN_RELATIVE = 0.12  # step between neighbours, as a share of the depth range, above which a slope is an edge
-BLURRED_PX = 5  # width over which an edge of the depth map may be blurred
-MIXED_PX = 2  # distance from an edge up to which colours may be mixed from both sides
-REACH_PX = 10  # largest distance from which a colour is taken to replace a mixed colour
-BEHIND_SHARE = 0.1  # width of the background that is invented behind an edge, as a share of the picture's width
-SET_BACK = 0.004  # offset of the invented surface to the rear, as a share of the depth range
-SAMPLES = 4  # samples per pixel, which smooth split edges
+COLUMNS = 320  # resolution of smooth areas: as fine as a depth camera's, and fast without a GPU
+FINEST_COLUMNS = 1600  # finest resolution at edges
+NOMINAL_DISTANCE_M = 0.6  # viewing distance at which the surface looks exactly like the picture
+TORN_RELATIVE = 0.12  # a step between neighbours is an edge if it exceeds this share of the depth range
+BLURRED_PX = 5  # width over which the depth map's edges may be blurred
+MIXED_PX = 2  # colours within this distance from an edge may be a mixture of both sides
+REACH_PX = 10  # a mixed colour is replaced by a colour at most this far away
+BEHIND_SHARE = 0.1  # width of the background invented behind an edge, as a share of the picture's width
+SET_BACK = 0.004  # shift of the invented surface to the rear, as a share of the depth range
+SAMPLES = 4  # samples per pixel, to smooth split edges
 
 Mask = NDArray[np.bool_]
 
 
 def split_rgbd(rgb: U8, path: Path) -> tuple[U8, F32]:
-    """Split a picture into its left half, colour (h, w, 3), and its right half, depth (h, w).
+    """Split a picture into colour (left half, shape (h, w, 3)) and depth (right half, shape (h, w)).
 
     Depth is 0 at the rear and 1 at the front. Raises InputError if the picture is too small, or if the right half is
     not grey.
@@ -62,13 +62,13 @@ def split_rgbd(rgb: U8, path: Path) -> tuple[U8, F32]:
 def surfaces(colour: U8, depth: F32, *, stack: PanelStack, depth_m: tuple[float, float]) -> list[Part]:
     """Return the front surface and, if there are edges, the background behind them.
 
-    Each point of a surface is on the ray that leads from the nominal eye position to the point's pixel.
+    Each surface point is on the ray from the nominal eye position through the point's pixel.
 
     Args:
         colour: Picture (h, w, 3).
         depth: Depth (h, w), from 0 (rear) to 1 (front).
-        stack: Panels of the display, to whose size the picture is fitted.
-        depth_m: Coordinates x in frame `stack` of depth 0 and depth 1.
+        stack: The display's panels. The picture is fitted to their size.
+        depth_m: The x coordinates of depth 0 and depth 1 in frame `stack`.
     """
     depth = sharpened(depth)
     colour = unmixed(colour, depth)
@@ -92,9 +92,9 @@ def surfaces(colour: U8, depth: F32, *, stack: PanelStack, depth_m: tuple[float,
 
 
 def sharpened(depth: F32) -> F32:
-    """Sharpen the edges of a depth map (h, w).
+    """Sharpen the edges in a depth map (h, w).
 
-    A pixel in a blurred edge takes the depth of the near or the far side, depending on which depth is closer.
+    Each pixel in a blurred edge is given the near or the far side's depth, whichever is closer to its previous depth.
     """
     kernel = np.ones((BLURRED_PX, BLURRED_PX), np.uint8)
     high, low = cv2.dilate(depth, kernel), cv2.erode(depth, kernel)
@@ -103,9 +103,9 @@ def sharpened(depth: F32) -> F32:
 
 
 def unmixed(colour: U8, depth: F32) -> U8:
-    """Replace colours next to a depth edge, which may be mixed from both sides.
+    """Replace colours next to depth edges, because they may be a mixture of both sides.
 
-    The new colour is taken from a pixel on the same side that is farther from the edge.
+    Each new colour is taken from a pixel on the same side, farther from the edge.
 
     Args:
         colour: Picture (h, w, 3).
@@ -118,11 +118,11 @@ def unmixed(colour: U8, depth: F32) -> U8:
     if not beside.any():
         return colour
     there, wanted = np.argwhere(beside), np.argwhere(mixed)
-    far_apart = 4 * side / TORN_RELATIVE  # pixels per unit of depth, which keeps the other side from being nearest
+    far_apart = 4 * side / TORN_RELATIVE  # pixels per unit of depth, to keep the other side from being nearest
     away, nearest = cKDTree(np.column_stack([there, depth[beside] * far_apart])).query(
         np.column_stack([wanted, depth[mixed] * far_apart]), distance_upper_bound=REACH_PX
     )
-    near = np.isfinite(away)  # parts that are too thin to have a clean inside keep their colours
+    near = np.isfinite(away)  # parts too thin to have a clean inside keep their colours
     result = colour.copy()
     result[tuple(wanted[near].T)] = colour[beside][nearest[near]]
     return result
@@ -131,8 +131,8 @@ def unmixed(colour: U8, depth: F32) -> U8:
 def background(depth: F32, colour: U8) -> tuple[F32, U8, Mask]:
     """Invent the background behind depth edges.
 
-    The depth and the colour of the far side are continued behind the near side. The mask also includes a band of the
-    far side itself, which closes gaps at the edge.
+    The far side's depth and colour are continued behind the near side. The mask also includes a band of the far side
+    itself, to close gaps at the edge.
 
     Args:
         depth: Depth (h, w), from 0 to 1.
@@ -151,9 +151,9 @@ def background(depth: F32, colour: U8) -> tuple[F32, U8, Mask]:
 
 
 def _quads(depth: F32) -> I32:
-    """Divide a depth map into quads (n, 4), whose corners are flat indices of pixels.
+    """Divide a depth map into quads (n, 4), given as flat pixel indices of their corners.
 
-    Smooth areas have large quads, and edges have quads of single pixels. Quads that cross an edge are left out.
+    Smooth areas get large quads, and edges get single-pixel quads. Quads that cross an edge are left out.
     """
     rows, columns = depth.shape
     step = -(-columns // COLUMNS)
@@ -184,7 +184,7 @@ def _corners(row: Any, column: Any, columns: int) -> I32:
 
 
 def _placed(depth: F32, quads: I32, picture: U8, *, stack: PanelStack, depth_m: tuple[float, float]) -> Part:
-    """Convert the quads of a depth map to triangles in frame `stack`, with the picture as their texture."""
+    """Convert a depth map's quads to triangles in frame `stack`, with the picture as their texture."""
     rows, columns = depth.shape
     used, corners = np.unique(quads, return_inverse=True)
     corners = corners.reshape(-1, 4)
@@ -202,7 +202,7 @@ def _placed(depth: F32, quads: I32, picture: U8, *, stack: PanelStack, depth_m: 
 
 
 def _edge_to_edge(index: Any, count: int) -> F64:
-    """Return the coordinates of pixel centres. Those of the outermost pixels are moved to the edge."""
+    """Return pixel centre coordinates, with those of the outermost pixels moved to the edge."""
     place = index + 0.5
     return np.where(index == 0, 0.0, np.where(index == count - 1, float(count), place))
 
@@ -213,7 +213,7 @@ def prepare(file: SceneFile) -> Callable[..., TriangleSource]:
     Raises InputError if the picture cannot be read or its right half is not a depth map.
     """
     colour, depth = split_rgbd(open_frames(file.path, file.settings).frame(0), file.path)
-    # The edges of a split surface are also inside its outline, so they need multisampling instead of ramps.
+    # A split surface also has edges inside its outline, so it needs multisampling instead of ramps.
     surface_parts = surfaces(colour, depth, stack=file.stack, depth_m=file.settings.depth_m)
     parts = [DrawnPart(part, outlined=False) for part in surface_parts]
     info = ContentInfo(file.path.stem, background=file.background)

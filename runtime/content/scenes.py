@@ -1,4 +1,4 @@
-"""Built-in scenes, whose lengths are scaled to the height of the display."""
+"""Built-in scenes. Their lengths are scaled to the display's height."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from runtime.records import F64
 
 @dataclass(frozen=True, slots=True)
 class Thing:
-    """Object in a scene. Lengths are in metres for a display that is 0.2916 m high."""
+    """An object in a scene. Lengths are in metres for a display that is 0.2916 m high."""
 
     shape: Shape  # centred on the origin
-    texture: str  # name of a texture, or `plain`
-    centre_m: tuple[float, float, float]  # position of the shape's origin in frame `stack`
-    colour: Colour = WHITE  # factor on the colours of the texture
+    texture: str  # texture name, or `plain`
+    centre_m: tuple[float, float, float]  # the shape's origin in frame `stack`
+    colour: Colour = WHITE  # multiplies the texture's colours
     rotation: F64 | None = None  # 3x3 rotation from the shape's frame to `stack`
     turns_per_s: float = 0.0  # revolutions about the vertical axis, in a moving scene
     lit: bool = True  # True if the lamp shades the object
@@ -28,14 +28,14 @@ class Thing:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Built-in scene, which consists of objects on a uniform background."""
+    """A built-in scene: objects on a uniform background."""
 
     name: str
     things: tuple[Thing, ...]
     background: Colour = WHITE
     moving: bool = False
     grey: bool = False
-    flat: bool = False  # True if all objects are in the plane of the middle panel
+    flat: bool = False  # True if all objects are in the middle panel's plane
 
 
 def _turned(yaw_deg: float, pitch_deg: float = 0.0) -> F64:
@@ -84,9 +84,9 @@ def _demo(turns_per_s: float = 0.0) -> tuple[Thing, ...]:
 
 
 def _room() -> tuple[Thing, ...]:
-    """Return a dim room with objects, the nearest of which is a globe.
+    """Return a dim room with objects in it. The nearest one is a globe.
 
-    The room is behind the display and wider than the display.
+    The room is behind the display and wider than it.
     """
     wide, high, back = 0.56, 0.34, -0.14
     deep = 0.02 - back

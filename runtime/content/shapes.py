@@ -1,4 +1,4 @@
-"""Triangle meshes (shapes) and functions that create them. The normals of a shape point outwards."""
+"""Triangle meshes (shapes) and functions that create them. Every shape's normals point outwards."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from runtime.records import F32, F64
 
 I32 = NDArray[np.int32]
 
-AT_ONCE = 1 << 17  # number of vertices or faces that are processed together, which limits the memory used
+AT_ONCE = 1 << 17  # number of vertices or faces processed together, to limit memory use
 
-# Letters that built-in scenes need, with 5 x 7 cells and one string per row.
+# Letters needed by the built-in scenes, in 5 x 7 cells with one string per row.
 GLYPHS = {
     "3": ("####.", "....#", "....#", ".###.", "....#", "....#", "####."),
     "D": ("####.", "#...#", "#...#", "#...#", "#...#", "#...#", "####."),
@@ -33,12 +33,12 @@ class Shape:
     """Triangle mesh with normals and texture coordinates."""
 
     positions_m: F32  # (v, 3) vertices
-    normals: F32  # (v, 3) unit normals of the vertices
-    uv: F32  # (v, 2) texture coordinates of the vertices
-    triangles: I32  # (t, 3) indices of the vertices of each triangle
+    normals: F32  # (v, 3) unit normal at each vertex
+    uv: F32  # (v, 2) texture coordinates at each vertex
+    triangles: I32  # (t, 3) indices of each triangle's vertices
 
     def moved(self, rotation: F64 | None = None, offset_m: ArrayLike = (0.0, 0.0, 0.0)) -> Shape:
-        """Return a copy of the shape that is rotated about the origin by a 3x3 matrix and then shifted."""
+        """Return a copy of the shape, rotated about the origin by a 3x3 matrix and then shifted."""
         turn = np.eye(3) if rotation is None else rotation
         positions = self.positions_m @ turn.T + np.asarray(offset_m)
         return Shape(positions.astype(np.float32), (self.normals @ turn.T).astype(np.float32), self.uv, self.triangles)
@@ -58,10 +58,10 @@ def join(shapes: Sequence[Shape]) -> Shape:
 
 
 def flat_normals(corners: ArrayLike) -> F32:
-    """Return the unit normals (t, 3) of triangles, which are zero for triangles without area.
+    """Return the triangles' unit normals (t, 3). The normal is zero if a triangle has no area.
 
     Args:
-        corners: Positions (t, 3, 3) of the three corners of each triangle.
+        corners: Positions (t, 3, 3) of each triangle's three corners.
     """
     corners = np.asarray(corners)
     normals = np.empty((len(corners), 3), np.float32)
@@ -76,9 +76,9 @@ def placed(positions: ArrayLike, normals: ArrayLike | None, matrices: F64) -> tu
     """Transform positions and normals by an affine matrix.
 
     Args:
-        positions: Positions (v, 3) of the vertices.
-        normals: Normals (v, 3) of the vertices, or None.
-        matrices: Matrix (4, 4) for all vertices, or one matrix (v, 4, 4) for each vertex.
+        positions: Vertex positions (v, 3).
+        normals: Vertex normals (v, 3), or None.
+        matrices: One matrix (4, 4) for all vertices, or one matrix per vertex (v, 4, 4).
 
     Returns:
         Positions (v, 3) and unit normals (v, 3). The normals are None if none are given.
@@ -100,12 +100,12 @@ def placed(positions: ArrayLike, normals: ArrayLike | None, matrices: F64) -> tu
 
 
 def _times(matrix: NDArray[Any], vectors: NDArray[Any]) -> NDArray[Any]:
-    """Multiply vectors (v, 3) by a matrix (3, 3), or by a matrix (v, 3, 3) for each vector."""
+    """Multiply vectors (v, 3) by one matrix (3, 3), or by one matrix per vector (v, 3, 3)."""
     return np.asarray(vectors @ matrix.T if matrix.ndim == 2 else np.einsum("nij,nj->ni", matrix, vectors))
 
 
 def rotation_about(axis: int, angle_rad: float) -> F64:
-    """Return the 3x3 matrix of a right-handed rotation about the axis x (0), y (1) or z (2)."""
+    """Return the 3x3 matrix for a right-handed rotation about the x (0), y (1) or z (2) axis."""
     cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
     i, j = (axis + 1) % 3, (axis + 2) % 3
     matrix = np.eye(3)
@@ -132,12 +132,12 @@ def _shape(positions: F64, normals: F64, uv: F64, triangles: I32) -> Shape:
 
 
 def card(width_m: float, height_m: float, *, repeat: tuple[float, float] = (1.0, 1.0)) -> Shape:
-    """Return a rectangle in the plane x = 0, whose texture is upright and not mirrored as seen from +x.
+    """Return a rectangle in the plane x = 0. Seen from +x, its texture is upright and not mirrored.
 
     Args:
         width_m: Width along y.
         height_m: Height along z.
-        repeat: Number of repetitions of the texture along the width and the height.
+        repeat: Number of times the texture is repeated along the width and the height.
     """
     s, t, triangles = _grid(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
     positions = np.column_stack([0 * s, (s - 0.5) * width_m, (0.5 - t) * height_m])
@@ -147,7 +147,7 @@ def card(width_m: float, height_m: float, *, repeat: tuple[float, float] = (1.0,
 
 
 def box(size_m: Sequence[float]) -> Shape:
-    """Return a box that is centred on the origin. Each face shows the whole texture."""
+    """Return a box centred on the origin. Each face shows the whole texture."""
     sx, sy, sz = size_m
     turns = [
         (np.eye(3), (sy, sz), sx),
@@ -161,7 +161,7 @@ def box(size_m: Sequence[float]) -> Shape:
 
 
 def sphere(radius_m: float, *, columns: int = 48, rows: int = 24) -> Shape:
-    """Return a sphere that is centred on the origin and has its poles on the z axis."""
+    """Return a sphere centred on the origin, with its poles on the z axis."""
     s, t, triangles = _grid(np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1))
     longitude, polar = s * 2 * np.pi, t * np.pi
     normal = np.column_stack([np.cos(longitude) * np.sin(polar), np.sin(longitude) * np.sin(polar), np.cos(polar)])
@@ -172,8 +172,8 @@ def torus(radius_m: float, tube_m: float, *, columns: int = 64, rows: int = 24) 
     """Return a torus around the x axis.
 
     Args:
-        radius_m: Distance from the centre of the torus to the centre of the tube.
-        tube_m: Radius of the tube.
+        radius_m: Distance from the torus's centre to the centre of the tube.
+        tube_m: Tube radius.
         columns: Number of segments around the axis.
         rows: Number of segments around the tube.
     """
@@ -185,16 +185,16 @@ def torus(radius_m: float, tube_m: float, *, columns: int = 64, rows: int = 24) 
 
 
 def _runs(marks: str) -> list[tuple[int, int]]:
-    """Return the start and the length of each run of `#`."""
+    """Return each run of `#` as its start and length."""
     return [(match.start(), match.end() - match.start()) for match in re.finditer("#+", marks)]
 
 
 def lettering(text: str, *, cell_m: float, depth_m: float) -> Shape:
-    """Return a text of solid letters, which is centred on the origin and readable from +x.
+    """Return text in solid letters, centred on the origin and readable from +x.
 
     Args:
-        text: Text in letters that `GLYPHS` contains.
-        cell_m: Size of a cell. A letter has 5 x 7 cells, and one empty cell separates letters.
+        text: Text whose letters are all in `GLYPHS`.
+        cell_m: Cell size. Each letter is 5 x 7 cells in size, with a gap of one cell between letters.
         depth_m: Depth along x.
     """
     left = -(len(text) * 6 - 1) / 2
@@ -211,13 +211,13 @@ def lettering(text: str, *, cell_m: float, depth_m: float) -> Shape:
 
 
 def fence(width_m: float, height_m: float, *, bars: int, bar_m: float) -> Shape:
-    """Return a fence in the plane x = 0, which consists of upright bars and two rails.
+    """Return a fence with upright bars and two rails in the plane x = 0.
 
     Args:
         width_m: Width along y.
         height_m: Height along z.
         bars: Number of bars.
-        bar_m: Thickness of bars and rails.
+        bar_m: Thickness of the bars and rails.
     """
     upright = [
         box((bar_m, bar_m, height_m)).moved(offset_m=(0.0, y, 0.0))

@@ -30,7 +30,7 @@ from runtime.records import F32, F64
 from runtime.support.background import raise_if_abandoned
 from runtime.support.gl import DrawnPicture
 
-CUSTOM, CUSTOM_SPZ = ("-y", "-z"), ("+y", "+z")  # axes (up, to the viewer); trainers use the camera axes of OpenCV
+CUSTOM, CUSTOM_SPZ = ("-y", "-z"), ("+y", "+z")  # axes (up, to the viewer); trainers use OpenCV's camera axes
 FLOATS = 8  # floats per corner: clip position (2), position in standard deviations (2), colour and opacity (4)
 VERTEX = """
 #version 330
@@ -59,9 +59,9 @@ void main() {
 
 
 def prepare(file: SceneFile) -> Callable[..., SplatSource]:
-    """Read a file of splats, and return a function that creates the source in a GL context.
+    """Read a splat file, and return a function that creates the source in a GL context.
 
-    Raises InputError if the file cannot be read or contains no visible splat.
+    Raises InputError if the file cannot be read or contains no visible splats.
     """
     suffix = file.path.suffix.lower()
     if suffix == ".ply":
@@ -75,12 +75,12 @@ def prepare(file: SceneFile) -> Callable[..., SplatSource]:
 
 
 class SplatSource(CanvasSource):
-    """Source that draws a scene of Gaussian splats."""
+    """Source that draws a Gaussian splat scene."""
 
     def __init__(self, gaussians: Gaussians, *, stack_from_scene: F64, context: Any, info: ContentInfo) -> None:
         super().__init__(context, info=info, deep=True)
         self._gaussians = moved(gaussians, stack_from_scene)
-        self._seen: list[Splats | None] = [None] * SIDES  # visible splats in each side's newest picture
+        self._seen: list[Splats | None] = [None] * SIDES  # visible splats in each side's latest picture
         linear = stack_from_scene[:3, :3]
         self._scene_from_stack_rotation = (np.linalg.inv(linear) * np.cbrt(np.linalg.det(linear))).astype(np.float32)
         self._program = context.program(vertex_shader=VERTEX, fragment_shader=FRAGMENT)
@@ -97,7 +97,7 @@ class SplatSource(CanvasSource):
         self.held += [self._program, self._buffer, indices, self._vertices]
 
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture:
-        """Draw the visible splats from the farthest to the nearest."""
+        """Draw the visible splats, farthest first."""
         splats = self._seen[view.side] = seen_splats(self._gaussians, view)
         count = len(splats.index)
 

@@ -1,4 +1,4 @@
-"""Procedural RGBA textures (256, 256, 4) of the built-in scenes, which are the same on every machine."""
+"""Procedural RGBA textures (256, 256, 4) for the built-in scenes, identical on every machine."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def _noise(seed: int, octaves: int = 4) -> F64:
 
 
 def checker() -> U8:
-    """Return a chequerboard of 8 x 8 squares with fine lines between the squares."""
+    """Return a chequerboard of 8 x 8 squares with fine lines between them."""
     u, v = _coordinates()
     squares = (np.floor(u * 8) + np.floor(v * 8)) % 2
     lines = np.minimum(np.abs(u * 8 - np.rint(u * 8)), np.abs(v * 8 - np.rint(v * 8))) < 0.04
@@ -108,5 +108,5 @@ TEXTURES = {
 
 
 def texture(name: str) -> U8 | None:
-    """Return a texture (256, 256, 4) by name, or None for `plain`, which stands for a uniform colour."""
+    """Return a texture (256, 256, 4) by name, or None for `plain`, which means a uniform colour."""
     return None if name == "plain" else TEXTURES[name]()

@@ -1,6 +1,6 @@
 """Draw textured, coloured and lit triangles with OpenGL.
 
-The shaders of each part are compiled with only those features that the part needs, such as lamp, texture or vertex
+Each part's shaders are compiled with only the features that the part needs, such as a lamp, a texture or vertex
 colours.
 """
 
@@ -24,13 +24,13 @@ from runtime.records import F32, F64, U8
 from runtime.support.background import raise_if_abandoned
 from runtime.support.gl import DrawnPicture
 
-PROJECTED_MAX = 5000  # most vertices that are projected to find a part's extent; for more, its box is projected instead
-DRAWN_AT_ONCE = 20_000  # number of triangles in a draw call
-UPLOADED_AT_ONCE = 8 << 20  # number of bytes in an upload
+PROJECTED_MAX = 5000  # if a part has more vertices, its box is projected instead to find its extent
+DRAWN_AT_ONCE = 20_000  # triangles per draw call
+UPLOADED_AT_ONCE = 8 << 20  # bytes per upload
 ATTRIBUTES = ("in_normal", "in_uv", "in_colour")
 OUTLINE_FLOATS = 5 + 9  # floats per corner: clip coordinates and coverage (5), attributes (9)
 
-ANY_ALPHA = 2.0  # limit that is larger than every alpha
+ANY_ALPHA = 2.0  # limit that is larger than any alpha
 VERTEX = """
 #ifdef OUTLINE
 in vec4 in_clip;
@@ -129,9 +129,9 @@ void main() {
 
 
 class DrawnPart:
-    """Part that is prepared for drawing, and after `upload` also owns GL objects.
+    """Part prepared for drawing. After `upload`, it also owns GL objects.
 
-    A part can be prepared on any thread, without a GL context. The source of the part uploads it later.
+    A part can be prepared on any thread, without a GL context. The part's source uploads it later.
     """
 
     def __init__(self, part: Part, *, outlined: bool = True) -> None:
@@ -139,8 +139,8 @@ class DrawnPart:
 
         Args:
             part: Part to draw.
-            outlined: Find the edges of the part, whose outlines can then be smoothed. Translucent and large parts are
-                never outlined.
+            outlined: Find the part's edges, so that its outlines can be smoothed. Translucent and large parts are never
+                outlined.
         """
         mesh = part.shape
         self.features, self.sampler = part.features, part.sampler
@@ -165,7 +165,7 @@ class DrawnPart:
 
     @property
     def positions(self) -> F32:
-        """Positions (v, 3) of the vertices, in the part's frame. They may be empty after `upload`."""
+        """Vertex positions (v, 3) in the part's frame. They may be empty after `upload`."""
         return self.vertices[:, :3]
 
     def upload(self, context: Any, surface_program: Any, outline: Any, textures: list[Any]) -> None:
@@ -175,7 +175,7 @@ class DrawnPart:
             context: Current moderngl context.
             surface_program: Shader program for the triangles, owned by the source.
             outline: Vertex array for outlines, owned by the source.
-            textures: Textures of the part, owned by the source.
+            textures: The part's textures, owned by the source.
         """
         self.surface_program, self.outline, self.textures = surface_program, outline, textures
         self._buffer, self._triangles = (_uploaded(context, array) for array in (self.vertices, self.triangles))
@@ -200,7 +200,7 @@ class DrawnPart:
 
 
 class _Place:
-    """Placement of a part in a scene, with matrices that do not depend on the view."""
+    """A part's placement in a scene, with the matrices that do not depend on the view."""
 
     def __init__(self, stack_from_part: F64) -> None:
         linear = stack_from_part[:3, :3]
@@ -211,7 +211,7 @@ class _Place:
 
 
 class _Look:
-    """Placement of a part as seen in one view, with the matrices that shaders need."""
+    """A part's placement as seen in one view, with the matrices that its shaders need."""
 
     def __init__(self, place: _Place, clip_from_stack: F64, view: View) -> None:
         inverse = place.part_from_stack
@@ -221,7 +221,7 @@ class _Look:
         self._clip, self._normals = _gl(self.clip_from_part), _gl(turned)
 
     def set(self, program: Any, part: DrawnPart) -> None:
-        """Set the uniforms and the textures with which a program draws a part."""
+        """Set the uniforms and textures that a program needs to draw a part."""
         for name, matrix in (("stack_from_part", self._normals), ("clip_from_part", self._clip)):
             if (uniform := program.get(name, None)) is not None:
                 uniform.write(matrix)
@@ -232,12 +232,12 @@ class _Look:
 
 @dataclass(frozen=True, slots=True)
 class _Arrangement:
-    """Placements of all parts of a scene at a time."""
+    """The placements of all of a scene's parts at one time."""
 
     places: list[_Place]  # placement of each part; parts may share a placement
-    points_m: F64  # (n, 3) points whose convex hull contains all parts, frame `stack`
+    points_m: F64  # (n, 3) points in frame `stack`; their convex hull contains all parts
     corners_m: F64  # (p, 8, 3) corners of each part's bounding box, frame `stack`
-    nearest_first: NDArray[np.intp]  # (p,) indices of the parts from the nearest to the farthest
+    nearest_first: NDArray[np.intp]  # (p,) indices of the parts, nearest first
 
 
 class TriangleSource(CanvasSource):
@@ -256,16 +256,16 @@ class TriangleSource(CanvasSource):
 
         Args:
             parts: Parts to draw.
-            stack_from_parts: Placement of each part, a 4x4 similarity.
+            stack_from_parts: Each part's placement, a 4x4 similarity.
             context: Current moderngl context.
-            info: Properties of the scene.
-            samples: Number of samples per pixel. If 0, outlines are smoothed by ramps instead of multisampling, which
-                is faster on a software rasteriser.
+            info: Scene properties.
+            samples: Samples per pixel. If 0, outlines are smoothed with ramps instead of multisampling, which is faster
+                on a software rasteriser.
         """
         super().__init__(context, info=info, samples=samples)
         self.parts, self.stack_from_parts = list(parts), list(stack_from_parts)
         self._with_ramps = samples == 0
-        self._still: _Arrangement | None = None  # arrangement of a static scene
+        self._still: _Arrangement | None = None  # arrangement, if the scene is static
         self._programs: dict[tuple[str, ...], Any] = {}
         self._textures: dict[tuple[int, Sampler], Any] = {}
         self._outlined = [(n, part, part.edges) for n, part in enumerate(self.parts) if part.edges is not None]
@@ -286,7 +286,7 @@ class TriangleSource(CanvasSource):
         self.held += [*self._textures.values(), *self._programs.values()]
 
     def places(self, time_ns: int) -> Sequence[F64]:
-        """Return the 4x4 placement of each part at a time.
+        """Return each part's 4x4 placement at a given time.
 
         Subclasses for moving scenes override this method. The default returns constant placements.
         """
@@ -306,7 +306,7 @@ class TriangleSource(CanvasSource):
             corners.append(part.corners_m @ matrix[:3, :3].T + matrix[:3, 3])
             is_few = part.is_projected
             points.append(part.positions @ matrix[:3, :3].T + matrix[:3, 3] if is_few else corners[-1])
-        # Drawing the nearest part first saves the shading of hidden pixels.
+        # Drawing the nearest parts first avoids shading hidden pixels.
         order = np.argsort([-box[:, 0].mean() for box in corners], kind="stable")
         found = _Arrangement([shared[id(m)] for m in matrices], np.concatenate(points), np.stack(corners), order)
         if is_still:
@@ -314,7 +314,7 @@ class TriangleSource(CanvasSource):
         return found
 
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture:
-        """Draw the picture of a view. Drawing the same view at the same time gives identical pixels."""
+        """Draw a view's picture. Drawing the same view at the same time gives identical pixels."""
         arranged = self._arranged(time_ns)
         corners_m = arranged.corners_m.reshape(-1, 3)
         area = camera.covered_box(view, corners_m)
@@ -341,14 +341,14 @@ class TriangleSource(CanvasSource):
         return picture
 
     def _draw_translucent(self, placed: list[tuple[DrawnPart, _Look]]) -> None:
-        """Blend translucent parts over opaque parts, from the farthest part to the nearest.
+        """Blend translucent parts over opaque parts, farthest first.
 
-        The back faces of each part are drawn before the front faces.
+        Each part's back faces are drawn before its front faces.
         """
         context, framebuffer = self.context, self.context.fbo
         context.enable_only(context.DEPTH_TEST | context.BLEND | context.CULL_FACE)
         context.blend_func = OVER
-        context.front_face = "cw"  # rows of the raster run along y in OpenGL, which mirrors triangles
+        context.front_face = "cw"  # the raster's rows run along +y in OpenGL, which mirrors triangles
         framebuffer.depth_mask = False
         for part, look in reversed(placed):
             if part.is_blended:
@@ -369,7 +369,7 @@ class TriangleSource(CanvasSource):
         return self._programs[features]
 
     def _outline(self, features: tuple[str, ...]) -> Any:
-        """Return the vertex array that draws the outlines of parts with the given features."""
+        """Return the vertex array for drawing the outlines of parts with the given features."""
         if features not in self._outlines:
             program = self._program((*features, "OUTLINE"))
             names = ("in_clip", "in_coverage", *ATTRIBUTES)
@@ -390,7 +390,7 @@ class TriangleSource(CanvasSource):
         return self._textures[key]
 
     def _draw_outlines(self, looks: list[_Look], nearest_first: NDArray[np.intp], view: View) -> None:
-        """Draw ramps along the outlines of all parts, from the farthest part to the nearest."""
+        """Draw ramps along all parts' outlines, farthest part first."""
         eyes = [looks[n].eye for n, _, _ in self._outlined]
         seen, of_part = self._edges.seen(eyes)
         rank = np.argsort(nearest_first)[[n for n, _, _ in self._outlined]]
@@ -418,7 +418,7 @@ class TriangleSource(CanvasSource):
 
 
 def _set_uniforms(program: Any, **values: Any) -> None:
-    """Set uniforms of a program. Those that the compiler has removed are ignored."""
+    """Set a program's uniforms. Uniforms that the compiler has removed are ignored."""
     for name, value in values.items():
         if (uniform := program.get(name, None)) is not None:  # the operator `in` would try all names in turn
             uniform.value = value
@@ -439,13 +439,13 @@ def _gl(matrix: F64) -> F32:
 
 
 def _layout(program: Any, buffer: Any, names: tuple[str, ...], sizes: tuple[int, ...]) -> tuple[Any, ...]:
-    """Describe a buffer for a vertex array of moderngl.
+    """Describe a buffer for a moderngl vertex array.
 
     Args:
         program: Program that reads the buffer. Attributes that the compiler has removed are skipped.
         buffer: Buffer with the attributes of consecutive vertices.
         names: Names of the attributes.
-        sizes: Number of floats of each attribute.
+        sizes: Number of floats in each attribute.
     """
     used = [name for name in names if name in program]
     formats = [f"{size}f" if name in used else f"{size * 4}x" for name, size in zip(names, sizes, strict=True)]

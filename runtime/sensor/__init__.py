@@ -1,1 +1,1 @@
-"""Drivers for depth cameras and eye trackers, recordings, and the thread that polls a driver."""
+"""Drivers for depth cameras and eye trackers, recordings, and the thread that polls the driver."""

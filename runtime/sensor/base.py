@@ -1,4 +1,4 @@
-"""Interface of sensor drivers, and conversion of device timestamps to the host's clock."""
+"""Interface for sensor drivers, and conversion of device timestamps to the host's clock."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from runtime.config import Section
 from runtime.errors import EndOfRecording, SensorLost, SensorTimeout
 from runtime.records import SensorFrame
 
-ARRIVED_MAX = 1024  # maximum number of samples that one call returns
-WINDOW_NS = 5_000_000_000  # duration of the windows over which a device clock's offset is estimated
+ARRIVED_MAX = 1024  # maximum number of samples returned by one call
+WINDOW_NS = 5_000_000_000  # a device clock's offset is estimated over windows of this duration
 
 
 @dataclass(frozen=True, slots=True)
 class Capabilities:
-    """Kinds of data that a sensor delivers, and how the data must be treated."""
+    """Kinds of data that a sensor delivers, and how to treat them."""
 
     colour: bool = False
     depth: bool = False
     eye_points: bool = False  # the sensor finds the eyes itself, so the eye finder is not used
-    in_stack_frame: bool = False  # eye points are in the frame `stack` and need no calibration
-    may_pause: bool = False  # gaps and constant samples are no faults, for example in a recording
+    in_stack_frame: bool = False  # eye points are in frame `stack` and need no calibration
+    may_pause: bool = False  # gaps and constant samples are not faults, for example in a recording
 
 
 class Sensor(ABC):
-    """Base class of drivers for depth cameras, eye trackers and recordings.
+    """Base class for drivers of depth cameras, eye trackers and recordings.
 
-    The constructor only stores settings. `open` acquires the device, and cleans up if this fails. Only one thread uses
-    a driver. The thread may be abandoned if an SDK hangs.
+    The constructor only stores settings. `open` acquires the device, and cleans up if this fails. A driver is used by
+    only one thread, which may be abandoned if an SDK hangs.
 
     A custom driver is configured by `sensor.driver = "module:Class"` and constructed as `Class(options, clock=clock)`.
-    `options` is an instance of the class's `Options`, validated from `[sensor.options]`. `clock` is the run's clock, on
-    which capture times must be based.
+    `options` is an instance of the class's `Options`, validated from `[sensor.options]`. `clock` is the run's clock.
+    Capture times must be based on it.
     """
 
     Options: ClassVar[type[BaseModel]] = Section  # schema of [sensor.options] for a custom class
@@ -96,9 +96,9 @@ class SteppedSensor(Sensor):
         """Store the settings.
 
         Args:
-            source: Name of the source in messages.
-            clock: The run's clock, on which capture times must be based.
-            latency_ms: Delay of each sample from capture to arrival.
+            source: Name to use for the source in messages.
+            clock: The run's clock. Capture times must be based on it.
+            latency_ms: Each sample's delay from capture to arrival.
         """
         self._source, self._clock, self._latency_ns = source, clock, round(latency_ms * NS_PER_MS)
         self._frames: Iterator[SensorFrame] | None = None  # samples that follow `_next`; None if not open
@@ -131,7 +131,7 @@ class SteppedSensor(Sensor):
         return frame
 
     def available_ns(self, frame: SensorFrame) -> int:
-        """Return the time at which a sample arrives, on the run's clock."""
+        """Return a sample's arrival time on the run's clock."""
         return frame.capture_ns + self._latency_ns
 
     def read_newest(self, timeout_s: float) -> SensorFrame:
@@ -170,15 +170,15 @@ class SteppedSensor(Sensor):
 
 
 class DeviceClock:
-    """Converter of device timestamps to the host's clock, based on the fastest recent delivery.
+    """Converts device timestamps to the host's clock, based on the fastest recent delivery.
 
-    The delay between a timestamp and the arrival of the sample varies, but the minimum delay over a few seconds is
-    nearly constant. A new window every few seconds follows the drift between the two clocks.
+    The delay between a timestamp and the sample's arrival varies, but the minimum delay over a few seconds is nearly
+    constant. A new window is started every few seconds, to follow the drift between the two clocks.
     """
 
     def __init__(self) -> None:
         self._start_ns = 0
-        self._offsets: list[int] = []  # minima of the previous and the current window
+        self._offsets: list[int] = []  # minimum offsets in the previous and the current window
         self._last_ns: int | None = None
 
     def host_ns(self, device_ns: int, *, arrival_ns: int) -> int:
@@ -186,7 +186,7 @@ class DeviceClock:
 
         Args:
             device_ns: Timestamp on the device's clock.
-            arrival_ns: Time at which the sample arrived, on the host's clock.
+            arrival_ns: The sample's arrival time on the host's clock.
         """
         offset = arrival_ns - device_ns
         if self._last_ns is None or device_ns < self._last_ns:  # first sample or restarted device

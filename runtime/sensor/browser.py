@@ -15,14 +15,14 @@ from runtime.errors import SensorLost, SensorTimeout
 from runtime.records import EyePoints, Intrinsics, SensorFrame
 from runtime.sensor.base import Capabilities, DeviceClock, Sensor
 
-AGAIN_NS = NS_PER_S // 30  # period at which the last position is repeated, because a page reports only movements
-SILENT_NS = 5 * NS_PER_S  # time without a message from a page after which there is no viewer
+AGAIN_NS = NS_PER_S // 30  # the last position is repeated at this interval, because a page reports only movements
+SILENT_NS = 5 * NS_PER_S  # there is no viewer if a page has sent no message for this long
 LEAST_SIGMA_M = 5e-5  # lower limit, so that noise-free samples have a regular covariance
-PICTURE_MAX_PX = 2048  # limit for the longer side of a page's camera picture
+PICTURE_MAX_PX = 2048  # maximum length of the longer side of a page's camera picture
 
 
 class BrowserEyes(Sensor):
-    """Driver that delivers the eye positions that a page sends, and repeats the last position in between."""
+    """Driver that delivers the eye positions sent by a page, and repeats the last position in between."""
 
     name = "browser"
     capabilities = Capabilities(eye_points=True, in_stack_frame=True, may_pause=True)
@@ -84,9 +84,9 @@ class BrowserEyes(Sensor):
 
 
 class BrowserCamera(Sensor):
-    """Driver that delivers the camera pictures that a web page sends.
+    """Driver that delivers the camera pictures sent by a web page.
 
-    The camera measures no depth, so the viewer's distance is estimated from the eye separation.
+    The camera does not measure depth, so the viewer's distance is estimated from the eye separation.
     """
 
     name = "browser"

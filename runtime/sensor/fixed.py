@@ -17,7 +17,7 @@ PERIOD_NS = NS_PER_S // 30
 
 
 class FixedDriver(SteppedSensor):
-    """Driver that delivers the configured eye positions thirty times a second, in the frame `stack`."""
+    """Driver that delivers the configured eye positions, in frame `stack`, thirty times a second."""
 
     name = "fixed"
     capabilities = Capabilities(eye_points=True, in_stack_frame=True, may_pause=True)

@@ -1,4 +1,4 @@
-"""Driver `openni2`: any camera that has an OpenNI2 driver, and `.oni` recordings."""
+"""Driver `openni2`: any camera with an OpenNI2 driver, and `.oni` recordings."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from runtime.sensor.openni2_library import load
 
 SERIAL_PROPERTY = 3  # ONI_DEVICE_PROPERTY_SERIAL_NUMBER
 DEPTH_1_MM, DEPTH_100_UM, RGB888, GRAY8 = 100, 101, 200, 202
-PAIR_APART_US = 40_000  # largest time between paired depth and colour: one period of an unsynchronised camera
-PAIR_WAIT_S = 0.02  # time for which a depth picture waits for the colour picture
+PAIR_APART_US = 40_000  # longest time between paired depth and colour: one frame period of an unsynchronised camera
+PAIR_WAIT_S = 0.02  # maximum time to wait for a depth picture's colour picture
 THREADS_STOP_S = 0.5  # fifteen periods of a recording's threads; three periods led to crashes on a busy machine
-DRAIN_MAX = 32  # maximum number of frames skipped per call, because a fast source could otherwise block the call
+DRAIN_MAX = 32  # maximum number of frames to skip per call, because a fast source could otherwise block the call
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -42,7 +42,7 @@ class _Picture(NamedTuple):
 
 
 class OpenNI2Driver(Sensor):
-    """Driver for OpenNI2 cameras, which delivers colour, and depth in millimetres.
+    """Driver for OpenNI2 cameras that delivers colour frames as well as depth frames in millimetres.
 
     Depth is registered to colour if the camera supports it. All calls into the library run on a `_PersistentThread`,
     which outlives the calling thread.
@@ -55,9 +55,9 @@ class OpenNI2Driver(Sensor):
         """Store the settings.
 
         Args:
-            settings: Settings whose `source` is a serial number, a device URI or a `.oni` file. An empty source or
-                `demo` selects the only connected camera.
-            clock: The run's clock, on which capture times are based.
+            settings: Sensor settings. `source` is a serial number, a device URI or a `.oni` file. If it is empty or
+                `demo`, the only connected camera is used.
+            clock: The run's clock. Capture times are based on it.
         """
         self._settings, self._clock = settings, clock
         self._thread: _PersistentThread | None = None  # None if not open
@@ -89,7 +89,7 @@ class OpenNI2Driver(Sensor):
             self._start_streams()
         except SensorLost:
             raise
-        except Exception as error:  # the package raises its own exceptions, those of ctypes and AssertionError
+        except Exception as error:  # the package raises its own exceptions, ctypes exceptions and AssertionError
             raise SensorLost(f"OpenNI2: {_text(error)}") from None
 
     def _find_device(self) -> Any:
@@ -137,7 +137,7 @@ class OpenNI2Driver(Sensor):
         self._times, self._newest, self._index = DeviceClock(), {}, 0
 
     def _read_intrinsics(self, stream: Any) -> Intrinsics | None:
-        """Return the intrinsics of a centred camera with the reported or the configured field of view.
+        """Return intrinsics for a centred camera with the reported or the configured field of view.
 
         Returns None if the field of view is neither reported nor configured.
         """
@@ -235,7 +235,7 @@ class OpenNI2Driver(Sensor):
         for stream in streams.values():
             _quietly(stream.stop)
         if streams and self._settings.source.endswith(".oni"):
-            # The library does not wait for the threads of a recording to stop. Without a pause, these threads would
+            # The library does not wait for a recording's threads to stop. Without a pause, these threads would
             # write to freed memory.
             time.sleep(THREADS_STOP_S)
         for handle in (*streams.values(), device):
@@ -244,7 +244,7 @@ class OpenNI2Driver(Sensor):
 
 
 def _quietly(call: Callable[[], object]) -> None:
-    """Call a function and log its exception, for example that of an unplugged camera."""
+    """Call a function and log any exception it raises, for example because a camera was unplugged."""
     try:
         call()
     except Exception as error:
@@ -252,7 +252,7 @@ def _quietly(call: Callable[[], object]) -> None:
 
 
 def _serial(device: Any) -> str:
-    """Return the serial number of a device, or an empty string if it has none."""
+    """Return a device's serial number, or an empty string if it has none."""
     import ctypes
 
     if not device.is_property_supported(SERIAL_PROPERTY):
@@ -262,7 +262,7 @@ def _serial(device: Any) -> str:
 
 
 def _text(error: Exception) -> str:
-    """Return the library's error message without the text that the package adds."""
+    """Return the library's error message without the text added by the package."""
     words = error.args[1] if len(error.args) > 1 else str(error) or type(error).__name__
     return words.decode(errors="replace").strip() if isinstance(words, bytes) else str(words)
 
@@ -292,8 +292,8 @@ def _pixels(frame: Any) -> U8 | U16:
 class _PersistentThread:
     """Thread that lives as long as the process and runs calls one at a time. Callers wait for the result.
 
-    At exit, OpenNI2 accesses every thread that has ever called the library, and crashes if the stack of such a thread
-    was freed. A `ThreadPoolExecutor` is not suitable, because Python ends the pool's threads earlier and waits for
+    At exit, OpenNI2 accesses every thread that has ever called the library, and crashes if such a thread's stack has
+    been freed. A `ThreadPoolExecutor` is not suitable, because Python ends the pool's threads earlier and waits for
     threads that hang in a call.
     """
 

@@ -1,4 +1,4 @@
-"""Load the library libOpenNI2 and its drivers.
+"""Load the libOpenNI2 library and its drivers.
 
 The `openni` package expects a folder that contains `libOpenNI2.so` and `OpenNI2/Drivers/`. Because Linux distributions
 install these files under other names, this module creates a folder of links. Drivers stay in memory: some drivers leave
@@ -34,10 +34,10 @@ _loaded = False
 
 
 def find_library(folder: str = "") -> tuple[Path, Path]:
-    """Return the paths of the library and of the folder with its drivers.
+    """Return the paths of the library and of its driver folder.
 
     Args:
-        folder: Folder in which to search. If empty, search the folders in `LIBRARY_FOLDERS`.
+        folder: Folder to search. If empty, search the folders in `LIBRARY_FOLDERS`.
 
     Raises:
         MissingPart: No searched folder contains both the library and its drivers.
@@ -54,7 +54,7 @@ def load(folder: str = "") -> Any:
     """Load the library and return the module `openni.openni2`.
 
     Args:
-        folder: Folder with the library. If empty, search the folders in `LIBRARY_FOLDERS`.
+        folder: Folder that contains the library. If empty, search the folders in `LIBRARY_FOLDERS`.
 
     Raises:
         MissingPart: The package `openni` or the library is missing.
@@ -75,7 +75,7 @@ def load(folder: str = "") -> Any:
         (links / "libOpenNI2.so").symlink_to(library)
         for file in sorted(drivers.glob("lib*.so*")):
             if DUMMY not in file.name:
-                # Debian's library looks for lib*.so.0, the original library for lib*.so.
+                # Debian's library looks for lib*.so.0, and the original library for lib*.so.
                 for name in {file.name, f"{file.name.split('.so')[0]}.so", f"{file.name.split('.so')[0]}.so.0"}:
                     (links / "OpenNI2" / "Drivers" / name).symlink_to(file)
         try:

@@ -1,6 +1,6 @@
 """Driver `realsense`: RealSense depth cameras, and recordings made with the RealSense SDK.
 
-The driver has been tested with recordings that the SDK plays (tests/sensor/test_realsense.py), but not yet with a
+The driver has been tested with recordings played by the SDK (tests/sensor/test_realsense.py), but not yet with a
 camera.
 """
 
@@ -20,9 +20,9 @@ from runtime.records import U8, U16, Intrinsics, SensorFrame
 from runtime.sensor.base import Capabilities, DeviceClock, Sensor
 
 RATE_HZ = 30
-FILES = (".bag", ".db3")  # old and new recording formats of the SDK
+FILES = (".bag", ".db3")  # the SDK's old and new recording formats
 STAMP_AGE_NS = NS_PER_S  # host timestamps older than this, or in the future, are ignored
-DRAIN_MAX = 32  # maximum number of frames skipped per call
+DRAIN_MAX = 32  # maximum number of frames to skip per call
 # Indices of the R, G and B channels in each supported format.
 COLOURS = {"rgb8": [0, 1, 2], "bgr8": [2, 1, 0], "rgba8": [0, 1, 2], "bgra8": [2, 1, 0]}
 
@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 
 class RealSenseDriver(Sensor):
-    """Driver for RealSense cameras, which delivers colour, depth in millimetres and intrinsics.
+    """Driver for RealSense cameras that delivers colour, depth in millimetres, and intrinsics.
 
     The SDK aligns depth to colour.
     """
@@ -42,9 +42,9 @@ class RealSenseDriver(Sensor):
         """Import the SDK and store the settings.
 
         Args:
-            settings: Settings whose `source` is a serial number or a recording with a suffix in `FILES`. An empty
-                source or `demo` selects the only connected camera.
-            clock: The run's clock, on which capture times are based.
+            settings: Sensor settings. `source` is a serial number, or a recording with a suffix in `FILES`. If it is
+                empty or `demo`, the only connected camera is used.
+            clock: The run's clock. Capture times are based on it.
         """
         import pyrealsense2
 
@@ -83,7 +83,7 @@ class RealSenseDriver(Sensor):
         self._times, self._number = DeviceClock(), -1
 
     def _serial_to_open(self) -> str:
-        """Return the serial number of the configured camera or, without a configuration, of the only camera.
+        """Return the configured camera's serial number or, if none is configured, the only camera's.
 
         Raises SensorLost if no connected camera matches or if several cameras match.
         """
@@ -120,7 +120,7 @@ class RealSenseDriver(Sensor):
             raise SensorLost(f"RealSense: {error}") from None
 
     def _next(self, deadline_ns: int) -> Any:
-        """Wait for frames with an unread depth picture and return these frames.
+        """Wait for frames with an unread depth picture and return them.
 
         Raises:
             SensorTimeout: No new frames arrived before the deadline.
@@ -164,9 +164,10 @@ class RealSenseDriver(Sensor):
         )
 
     def _capture_ns(self, frame: Any) -> int:
-        """Return the capture time of a depth picture on the run's clock.
+        """Return a depth picture's capture time on the run's clock.
 
-        The time is based on the SDK's timestamp on the host's clock or, without a plausible one, on the device's clock.
+        The time is based on the SDK's timestamp on the host's clock or, if there is no plausible one, on the device's
+        clock.
         """
         now_ns, stamp_ns = self._clock.now_ns(), round(frame.get_timestamp() * NS_PER_MS)
         age_ns: int = time.time_ns() - stamp_ns
@@ -180,7 +181,7 @@ class RealSenseDriver(Sensor):
         if pipeline is not None:
             try:
                 pipeline.stop()
-            except RuntimeError as error:  # for example an unplugged camera
+            except RuntimeError as error:  # for example, because the camera was unplugged
                 log.debug("RealSense: error while closing: %s", error)
 
 
@@ -193,7 +194,7 @@ def _rgb(frame: Any) -> U8:
 
 
 def _millimetres(frame: Any) -> U16:
-    """Copy a depth frame as (h, w) millimetres, in which 0 means not measured."""
+    """Copy a depth frame as (h, w) millimetres, where 0 means not measured."""
     raw: U16 = np.asanyarray(frame.get_data())
     unit_mm = float(frame.get_units()) * 1e3
     if abs(unit_mm - 1) < 1e-4:

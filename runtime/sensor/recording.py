@@ -1,6 +1,6 @@
 """Write and read recordings as MCAP files.
 
-The chunks of a file are small, which keeps every complete sample readable after a crash.
+Files consist of small chunks, so every complete sample remains readable after a crash.
 """
 
 from __future__ import annotations
@@ -28,30 +28,30 @@ from runtime.support.artifacts import put_in_place
 from runtime.support.background import BackgroundJob
 from runtime.support.untrusted_input import LIMITS, MIB
 
-CHUNK_BYTES = 4096  # size of a chunk: about 20 samples of eye points
-INDEX_SHARE = 1.1  # ratio of a file's size with chunk indices to the size without them
-SUMMARY_BYTES = 10_000  # size of a file's summary, including the schemas
-MAX_S, MAX_BYTES = 600.0, 2 << 30  # limits of a recording
+CHUNK_BYTES = 4096  # chunk size: about 20 samples of eye points
+INDEX_SHARE = 1.1  # ratio of a file's size with chunk indices to its size without them
+SUMMARY_BYTES = 10_000  # size of a file's summary, schemas included
+MAX_S, MAX_BYTES = 600.0, 2 << 30  # limits for a recording
 MAGIC = b"\x89MCAP0\r\n"
-RECORD, CHUNK = struct.Struct("<BQ"), b"\x06"  # header of a record, with kind and length; kind of a chunk
+RECORD, CHUNK = struct.Struct("<BQ"), b"\x06"  # a record's header, with kind and length; a chunk's kind
 CHUNK_HEAD = struct.Struct("<BQQQQII")  # record header, times, size, checksum, length of the compression's name
 EXPANDED_MOST = 8  # assumed compression ratio of a truncated chunk
-WINDOW_BYTES = 1 << 27  # maximum window size of zstandard
+WINDOW_BYTES = 1 << 27  # maximum zstandard window size
 NEEDED = "replay requires it and the topic `/eyes` (docs/sensors.md); other recordings need a driver of your own"
-KINDS = {  # hints for other file types, by their first bytes
+KINDS = {  # hints for other file types, keyed by their first bytes
     b"#ROSBAG ": " (a ROS 1 bag; convert it with `mcap convert`)",
     b"SQLite f": " (a ROS 2 bag in SQLite; convert it with `ros2 bag convert`)",
     b"version ": " (a Git LFS pointer; fetch the file with `git lfs pull`)",
 }
 
 SYNCED_WITHIN_S = 30.0  # maximum wait for a slow disk when a recording is finished
-SYNC_EVERY_NS = 2 * NS_PER_S  # duration of the data that a power cut may lose, if the disk is fast enough
+SYNC_EVERY_NS = 2 * NS_PER_S  # amount of data that may be lost in a power cut, if the disk is fast enough
 
 log = logging.getLogger(__name__)
 
 
 class RecordingWriter:
-    """Writer that appends samples to an open binary file, up to limits of duration and size."""
+    """Writer that appends samples to an open binary file, up to limits on duration and size."""
 
     def __init__(
         self,
@@ -65,7 +65,7 @@ class RecordingWriter:
 
         Args:
             file: Empty binary file. The caller closes it.
-            header: Properties of the recording. Pictures are written only if `colour` or `depth` is set.
+            header: Recording properties. Pictures are written only if `colour` or `depth` is set.
             max_s: Maximum time between the first and the last sample.
             on_first: Function to call after the first sample has been written.
         """
@@ -73,7 +73,7 @@ class RecordingWriter:
 
         self._file, self._max_ns, self._on_first = file, round(max_s * NS_PER_S), on_first
         self._images = header.colour or header.depth
-        # Without compression, files of eye points do not depend on a library's version.
+        # Without compression, eye-point files do not depend on a library's version.
         compression = CompressionType.LZ4 if self._images else CompressionType.NONE
         index = IndexType.CHUNK | IndexType.METADATA
         self._writer: Any = Writer(file, chunk_size=CHUNK_BYTES, compression=compression, index_types=index)
@@ -94,7 +94,7 @@ class RecordingWriter:
         return self._channels[topic]
 
     def write(self, frame: SensorFrame) -> bool:
-        """Append a sample, with its pictures before its eye points.
+        """Append a sample, writing its pictures before its eye points.
 
         Returns False, and writes nothing, if the sample would exceed the maximum duration or size.
         """
@@ -134,13 +134,13 @@ class RecordingWriter:
 
 @contextmanager
 def recording_to(path: Path, header: RecordingHeader, *, max_s: float = MAX_S) -> Iterator[RecordingWriter]:
-    """Open a writer for a new recording, which replaces an older file once the first sample is written.
+    """Open a writer for a new recording that replaces any older file once the first sample is written.
 
-    After a crash, the file is readable up to the last complete sample. A recording with pictures is readable only by
+    After a crash, the file is readable up to the last complete sample. A recording with pictures can be read only by
     the file's owner.
 
     Args:
-        header: Properties of the recording.
+        header: Recording properties.
         max_s: Maximum time between the first and the last sample.
 
     Raises:
@@ -180,10 +180,10 @@ def recording_to(path: Path, header: RecordingHeader, *, max_s: float = MAX_S) -
 
 
 class Recording:
-    """Recording that is read one sample at a time, because its pictures could fill the memory.
+    """A recording that is read one sample at a time, because its pictures could fill the memory.
 
     Attributes:
-        path: Path of the file.
+        path: File path.
         is_whole: True unless reading has found the file to be truncated or damaged.
         header: Properties of the whole recording.
         first: First sample.
@@ -192,10 +192,10 @@ class Recording:
     def __init__(self, path: Path) -> None:
         """Read the header and the first sample.
 
-        Raises InputError if the file cannot be read, is not a recording or contains no complete sample.
+        Raises InputError if the file cannot be read, is not a recording or contains no complete samples.
         """
         self.path, self.is_whole = path, True
-        self._written_by = ("", "")  # profile and library in the header of the MCAP file
+        self._written_by = ("", "")  # profile and library in the MCAP file's header
         self.header = self._read_header()
         first = next(self.samples(), None)
         if first is None:
@@ -207,9 +207,9 @@ class Recording:
         return untrusted_input.open_regular(self.path, most_bytes=LIMITS.file_bytes)
 
     def _read_header(self) -> RecordingHeader:
-        """Return the header from the metadata record, which repair tools move to the end of a file.
+        """Return the header from the metadata record, which repair tools move to the file's end.
 
-        Raises InputError if the file has no metadata record of phasestack, or if the record is not supported.
+        Raises InputError if the file has no phasestack metadata record, or if the record is not supported.
         """
         foreign = ""
         for topic, record in self._records():
@@ -252,14 +252,14 @@ class Recording:
             raise
         except OSError as error:
             raise InputError(self.path, "", f"cannot be read ({error.strerror})") from None
-        except Exception as error:  # the errors of mcap, lz4 and zstandard for a damaged file
+        except Exception as error:  # errors raised by mcap, lz4 and zstandard for a damaged file
             if self.is_whole:
                 problem = str(error) or type(error).__name__
                 log.warning("%s: the file is truncated or damaged; reading the intact part (%s)", self.path, problem)
             self.is_whole = False
 
     def samples(self) -> Iterator[SensorFrame]:
-        """Yield all complete samples in the order of the file.
+        """Yield all complete samples in file order.
 
         A sample is complete once its eye points have been read. Raises InputError if the file cannot be read or if a
         message is malformed.
@@ -284,15 +284,15 @@ class Recording:
 def _mcap_records(file: IO[bytes], *, source: Path, max_bytes: int) -> Iterator[Any]:
     """Yield all records up to the footer, including the records inside chunks.
 
-    If the end of the file cuts off a chunk, the complete records of this chunk are yielded before the exception.
+    If a chunk is cut off by the end of the file, its complete records are yielded before the exception is raised.
 
     Args:
-        source: Name of the file in messages.
+        source: File to name in messages.
         max_bytes: Maximum size of a record, and of a chunk after decompression.
 
     Raises:
         InputError: A chunk exceeds `max_bytes` after decompression.
-        Exception: The file is damaged. The exception is that of mcap or of a decompressor, or a ValueError.
+        Exception: The file is damaged. The exception is a ValueError, or one raised by mcap or by a decompressor.
     """
     from mcap.records import Chunk
     from mcap.stream_reader import StreamReader, breakup_chunk
@@ -313,9 +313,9 @@ def _mcap_records(file: IO[bytes], *, source: Path, max_bytes: int) -> Iterator[
                 raise ValueError(f"the chunk at byte {end} has no chunk marker")
     except InputError:
         raise
-    except Exception:  # the errors of mcap, lz4 and zstandard
+    except Exception:  # errors raised by mcap, lz4 and zstandard
         file.seek(-len(MAGIC), os.SEEK_END)
-        is_whole = file.read() == MAGIC  # a damaged file, whose lengths cannot be trusted
+        is_whole = file.read() == MAGIC  # if so, the file is damaged, and its lengths cannot be trusted
         file.seek(end)
         if not is_whole and (data := _cut_off_chunk(file.read(max_bytes))):
             yield from breakup_chunk(Chunk("", data, 0, 0, 0, len(data)))
@@ -323,7 +323,7 @@ def _mcap_records(file: IO[bytes], *, source: Path, max_bytes: int) -> Iterator[
 
 
 def _indexed_chunks(file: IO[bytes], *, max_bytes: int) -> set[int]:
-    """Return the byte offsets of the chunks that the file's summary lists.
+    """Return the byte offsets of the chunks listed in the file's summary.
 
     Returns an empty set if the file has no readable summary.
     """
@@ -344,7 +344,7 @@ def _indexed_chunks(file: IO[bytes], *, max_bytes: int) -> set[int]:
 
 
 def _cut_off_chunk(data: bytes) -> bytes:
-    """Return the decompressed complete records of a chunk that the end of the file cuts off.
+    """Return the complete records, decompressed, of a chunk cut off by the end of the file.
 
     Returns no bytes if the data do not begin with a chunk, or if the chunk is not cut off.
     """
@@ -363,15 +363,15 @@ def _cut_off_chunk(data: bytes) -> bytes:
 
 
 def _unpacked(chunk: Any, *, source: Path, max_bytes: int) -> bytes:
-    """Return the decompressed records of a chunk as bytes.
+    """Return a chunk's decompressed records as bytes.
 
     Args:
-        source: Name of the file in messages.
+        source: File to name in messages.
         max_bytes: Maximum size after decompression.
 
     Raises:
         InputError: The chunk exceeds `max_bytes` after decompression.
-        ValueError: The chunk does not have its declared size after decompression.
+        ValueError: After decompression, the chunk does not have the size it declares.
     """
     declared: int = chunk.uncompressed_size
     room = min(declared, max_bytes) + 1  # decompressors allocate up to their limit
@@ -388,8 +388,7 @@ def _expanded(compression: str, data: bytes, *, room: int) -> bytes:
     """Decompress data that may be truncated.
 
     Args:
-        compression: Name of the compression in the chunk. Data with a name other than `lz4` and `zstd` are returned
-            unchanged.
+        compression: Compression named in the chunk. Unless it is `lz4` or `zstd`, the data are returned unchanged.
         room: Maximum number of decompressed bytes.
     """
     if compression == "lz4":

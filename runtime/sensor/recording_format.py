@@ -1,4 +1,4 @@
-"""Define the topics, messages and schemas of recordings, and encode and decode the messages."""
+"""Define the topics, messages and schemas used in recordings, and encode and decode the messages."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ SCHEMA_VERSION = 1
 METADATA_NAME = "phasestack.recording"
 EYES_TOPIC, COLOUR_TOPIC, DEPTH_TOPIC, CALIBRATION_TOPIC = "/eyes", "/colour", "/depth", "/camera"
 POSITION_DIGITS = 7  # decimal places of a position in metres: 0.1 µm is far below any sensor's noise
-JPEG_QUALITY = 92  # quality of recorded colour pictures
+JPEG_QUALITY = 92  # JPEG quality of recorded colour pictures
 NUMBER_MAX = 1 << 62  # the sum of two such numbers fits in 64 bits; 146 years in nanoseconds
 COORDINATE_MAX_M = 1e6  # beyond any sensor's range in any unit; the tracker checks plausibility
-IMAGE_SIDE_MAX_PX = 1 << 15  # larger than the pictures of any camera
+IMAGE_SIDE_MAX_PX = 1 << 15  # larger than any camera's pictures
 
 Count = Annotated[int, Field(ge=0, le=NUMBER_MAX)]
 Unit = Annotated[float, Field(ge=0, le=1)]
@@ -37,7 +37,7 @@ M = TypeVar("M", bound=BaseModel)
 
 
 class Message(BaseModel):
-    """Base class of messages. Numbers must be finite JSON numbers, not strings or booleans."""
+    """Base class for messages. Numbers must be finite JSON numbers, not strings or booleans."""
 
     model_config = ConfigDict(strict=True, allow_inf_nan=False)
 
@@ -68,7 +68,7 @@ class Stamp(Message):
 
 
 class Stamped(Message):
-    """Base class of messages with a capture time. The fields are those of Foxglove's schemas."""
+    """Base class for messages with a capture time. The fields are the ones in Foxglove's schemas."""
 
     timestamp: Annotated[Stamp, WithJsonSchema({"type": "object"})]
     frame_id: str = "sensor"
@@ -120,7 +120,7 @@ SCHEMAS = {topic: message.model_json_schema() for topic, message in MESSAGES.ite
 
 @dataclass(frozen=True, slots=True)
 class RecordingHeader:
-    """Properties of a whole recording, which are stored as metadata."""
+    """Properties of a whole recording, stored as metadata."""
 
     driver: str  # name of the driver that delivered the samples
     serial: str = ""  # serial number of the sensor
@@ -128,7 +128,7 @@ class RecordingHeader:
     depth: bool = False  # True if the recording contains depth pictures
 
     def metadata(self) -> dict[str, str]:
-        """Return the header as MCAP metadata, which maps strings to strings."""
+        """Return the header as MCAP metadata, a mapping from strings to strings."""
         flags = {name: str(int(value)) for name, value in asdict(self).items() if isinstance(value, bool)}
         # `eye_points`: every sample contains the eyes, or null if there is no face.
         texts = {"schema_version": str(SCHEMA_VERSION), "driver": self.driver, "serial": self.serial, "eye_points": "1"}
@@ -150,7 +150,7 @@ class RecordingHeader:
 def _read(kind: type[M], data: bytes) -> M:
     """Parse a JSON message.
 
-    Raises ValueError if the message is invalid. The text of the error is one line that names the first invalid field.
+    Raises ValueError if the message is invalid. The error's text is one line that names the first invalid field.
     """
     try:
         return kind.model_validate_json(data)
@@ -170,7 +170,7 @@ def _array(points: tuple[Point, Point] | None) -> F64 | None:
 
 
 def eyes_message(frame: SensorFrame) -> bytes:
-    """Encode the eye points of a sample as JSON. Non-finite coordinates become null."""
+    """Encode a sample's eye points as JSON. Non-finite coordinates become null."""
     record: dict[str, Any] = {"sequence": frame.sequence, "capture_ns": frame.capture_ns}
     record["eyes_m"] = _points(frame.eyes.eyes_m if frame.eyes else None)
     if frame.eyes is not None:
@@ -213,7 +213,7 @@ def colour_message(colour: U8, *, capture_ns: int) -> bytes:
 
 
 def colour_from_message(data: bytes, *, max_pixels: int = 1 << 26) -> U8:
-    """Decode the result of `colour_message` to an (h, w, 3) RGB picture, which has the losses of JPEG.
+    """Decode the result of `colour_message` to an (h, w, 3) RGB picture, with JPEG's losses.
 
     Raises ValueError if the message is malformed, or if the picture is too large or cannot be decoded.
     """
@@ -249,7 +249,7 @@ def depth_from_message(data: bytes) -> U16:
 def calibration_message(intrinsics: Intrinsics, *, capture_ns: int) -> bytes:
     """Encode intrinsics as a JSON message that follows Foxglove's schema.
 
-    The centres of pixels have integer coordinates in this schema, and half-integer coordinates in `Intrinsics`.
+    Pixel centres have integer coordinates in this schema, and half-integer coordinates in `Intrinsics`.
     """
     i = intrinsics
     matrix = [i.fx_px, 0.0, i.cx_px - 0.5, 0.0, i.fy_px, i.cy_px - 0.5, 0.0, 0.0, 1.0]

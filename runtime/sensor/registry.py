@@ -1,4 +1,4 @@
-"""Registry of sensor drivers. A driver's module and SDK are imported only when the driver is used."""
+"""Sensor driver registry. A driver's module and SDK are imported only when the driver is used."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ def open_sensor(settings: SensorSettings, clock: Clock, *, latency_ms: float = 0
     """Create the configured driver without opening the device.
 
     Args:
-        settings: Settings whose `driver` is a name in `DRIVERS`, or `module:Class` for a custom driver.
-        clock: The run's clock, on which capture times are based.
-        latency_ms: Delay of replayed samples from capture to arrival. Other drivers ignore it.
+        settings: Sensor settings. `driver` is a name in `DRIVERS`, or `module:Class` for a custom driver.
+        clock: The run's clock. Capture times are based on it.
+        latency_ms: Replayed samples' delay from capture to arrival. Other drivers ignore it.
 
     Raises:
         InputError: The name is unknown, or the driver refuses its options.
-        MissingPart: The SDK of the driver is not installed.
+        MissingPart: The driver's SDK is not installed.
     """
     name = settings.driver
     if is_plugin(name):

@@ -19,15 +19,15 @@ log = logging.getLogger(__name__)
 
 
 def demo_recording_path() -> Path:
-    """Return the path of the demo recording, which is part of the package."""
+    """Return the path of the demo recording included in the package."""
     return Path(str(files("runtime.sensor") / "data" / "demo.mcap"))
 
 
 class ReplayDriver(SteppedSensor):
-    """Driver that plays a recording with the original rate and gaps, starting at `open`.
+    """Driver that plays back a recording at its original rate, including gaps, starting at `open`.
 
-    A sample arrives at its capture time plus the latency. A sample that is not later than its predecessor is skipped.
-    Only the first skipped sample is logged.
+    Each sample arrives at its capture time plus the latency. If a sample is not later than its predecessor, it is
+    skipped. Only the first skipped sample is logged.
     """
 
     name = "replay"
@@ -37,9 +37,9 @@ class ReplayDriver(SteppedSensor):
 
         Args:
             source: Path of a recording, or `demo` for the demo recording.
-            clock: The run's clock, to which capture times are shifted.
+            clock: The run's clock. Capture times are shifted to it.
             loop: Start again at the end of the recording.
-            latency_ms: Delay of each sample from capture to arrival.
+            latency_ms: Each sample's delay from capture to arrival.
         """
         self.path, self._loop = demo_recording_path() if source == "demo" else Path(source), loop
         super().__init__(str(self.path), clock, latency_ms=latency_ms)
@@ -74,7 +74,7 @@ class ReplayDriver(SteppedSensor):
     def _shifted(self, recording: Recording) -> Iterator[SensorFrame]:
         """Yield samples with capture times on the run's clock.
 
-        In a loop, the first sample follows the last one after the interval between the last two samples.
+        When looping, the first sample follows the last one after the same interval as between the last two samples.
         """
         last_ns = interval_ns = sequence_shift = last_sequence = shift_ns = 0
         is_first_round = True

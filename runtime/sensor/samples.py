@@ -1,4 +1,4 @@
-"""Sources of samples: the sensor thread in real time, or a recording on a simulated clock."""
+"""Sample sources: the sensor thread in real time, or a recording played against a simulated clock."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ AHEAD_NS = NS_PER_S // 10  # longer than the time from a sample's capture to the
 
 
 class Samples(ABC):
-    """Interface through which the presenter takes samples from a sensor without waiting."""
+    """Interface that lets the presenter take samples from a sensor without waiting."""
 
-    stale_inputs: int  # number of samples that were replaced by a newer sample before use
-    serial: str  # serial number of the sensor; empty: unknown
+    stale_inputs: int  # number of samples replaced by a newer one before use
+    serial: str  # the sensor's serial number; empty: unknown
 
     @abstractmethod
     def arrived(self, now_ns: int) -> list[SensorFrame]:
         """Return the samples that have arrived since the last call, oldest first.
 
         Raises:
-            EndOfRecording: All samples of the recording have been returned.
+            EndOfRecording: All of the recording's samples have been returned.
             FatalError: The sensor has failed permanently.
         """
 
     def fault(self) -> str:
-        """Return the reason why the sensor does not work, or an empty string."""
+        """Return the reason why the sensor is not working, or an empty string."""
         return ""
 
     def recorded_ahead(self) -> list[SensorFrame]:
@@ -50,7 +50,7 @@ def searched(frame: SensorFrame, find: FindEyes | None, *, keep_images: bool = F
     """Return a sample with the eyes found in its pictures, and without the pictures themselves.
 
     Args:
-        find: Eye finder. None leaves the eyes of the sample unchanged.
+        find: Eye finder. None leaves the sample's eyes unchanged.
         keep_images: Keep the pictures in the sample.
     """
     if find is not None:
@@ -59,7 +59,10 @@ def searched(frame: SensorFrame, find: FindEyes | None, *, keep_images: bool = F
 
 
 class RecordedSamples(Samples):
-    """Recording on a simulated clock. Each sample arrives at its capture time plus the latency."""
+    """A recording played back against a simulated clock.
+
+    Each sample arrives at its capture time plus the latency.
+    """
 
     def __init__(self, driver: Sensor) -> None:
         """Open the driver.

@@ -1,6 +1,6 @@
 """Driver `usb-camera`: webcams through V4L2, video files and network streams.
 
-A webcam measures no depth, so the viewer's distance is estimated from the eye separation.
+Webcams do not measure depth, so the viewer's distance is estimated from the eye separation.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from runtime.sensor.base import Capabilities, Sensor
 from runtime.support.film import open_film
 
 WAITED_NS = 3 * NS_PER_MS  # a picture that arrives sooner was queued, and newer pictures may follow
-QUEUE_MAX = 8  # maximum number of queued pictures skipped per read
+QUEUE_MAX = 8  # maximum number of queued pictures to skip per read
 STAMP_AGE_NS = NS_PER_S  # timestamps older than this, or in the future, are ignored
-STREAMS = ("rtsp", "rtsps", "http", "https")  # other protocols of FFmpeg may open files or listen on ports
+STREAMS = ("rtsp", "rtsps", "http", "https")  # FFmpeg's other protocols may open files or listen on ports
 
 
 class UsbCameraDriver(Sensor):
-    """Driver that delivers the newest picture of a camera.
+    """Driver that delivers a camera's newest picture.
 
-    The capture time of a webcam's picture is the kernel's timestamp for the end of the exposure. Other pictures get
+    A webcam picture's capture time is the kernel's timestamp for the end of the exposure. Other pictures are given
     their arrival time.
     """
 
@@ -40,9 +40,9 @@ class UsbCameraDriver(Sensor):
         """Store the settings.
 
         Args:
-            settings: Settings whose `source` is the number or path of a video device, a file, or a URL with a protocol
-                in `STREAMS`. An empty source or `demo` selects the first camera.
-            clock: The run's clock, on which capture times are based.
+            settings: Sensor settings. `source` is a video device's number or path, a file, or a URL with a protocol in
+                `STREAMS`. If it is empty or `demo`, the first camera is used.
+            clock: The run's clock. Capture times are based on it.
 
         Raises:
             InputError: The URL has another protocol, or the field of view is not configured. Webcams do not report

@@ -1,4 +1,4 @@
-"""Find known USB depth cameras and the problems with their connection, for the command `doctor`."""
+"""Find known USB depth cameras and any problems with their connection, for the `doctor` command."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SUPER_SPEED = 4  # libusb's constant for USB 3
 
 
 class KnownDevice(NamedTuple):
-    """Model of a USB depth camera that the driver `openni2` or `realsense` can open."""
+    """A USB depth camera model that the driver `openni2` or `realsense` can open."""
 
     vendor_id: int
     product_id: int
@@ -44,13 +44,13 @@ _BY_ID = {(device.vendor_id, device.product_id): device for device in KNOWN_DEVI
 
 @dataclass(frozen=True, slots=True)
 class UsbDevice:
-    """Connected USB depth camera of a known model."""
+    """A connected USB depth camera of a known model."""
 
     known: KnownDevice
     bus: int
     address: int
     serial: str  # serial number; empty: unknown or not readable
-    speed: int  # speed constant of libusb; 0: unknown
+    speed: int  # libusb's speed constant; 0: unknown
     is_accessible: bool  # True if this user may open the device
 
     def __str__(self) -> str:
@@ -58,7 +58,7 @@ class UsbDevice:
         return f"{self.known.name} ({usb_id}, {SPEEDS.get(self.speed, 'unknown')})"
 
     def problems(self) -> list[str]:
-        """Return the problems that prevent the use of this device, and a remedy for each problem."""
+        """Return the problems that prevent this device from being used, each with a remedy."""
         problems = []
         if self.known.needs_usb3 and 0 < self.speed < SUPER_SPEED:
             problems.append(f"connected at {SPEEDS[self.speed]}, needs USB 3; use a blue port and the original cable")
@@ -85,7 +85,7 @@ def find_devices(backend: Any = None) -> list[UsbDevice]:
     """Return all connected USB depth cameras of known models, ordered by bus and address.
 
     Args:
-        backend: Backend of pyusb. None selects the default backend.
+        backend: The pyusb backend. None selects the default one.
 
     Raises:
         MissingPart: pyusb or libusb is not installed.

@@ -1,6 +1,6 @@
-"""Poll a sensor driver in a thread, which queues the samples and reopens a lost sensor.
+"""Poll a sensor driver in a thread that queues the samples and reopens the sensor if it is lost.
 
-A thread that hangs in a call into an SDK is abandoned and replaced.
+If the thread hangs in an SDK call, it is abandoned and replaced.
 """
 
 from __future__ import annotations
@@ -22,45 +22,45 @@ from runtime.sensor.samples import FindEyes, Samples, searched
 from runtime.support.background import begin, patience_s
 from runtime.support.extras import missing_extra
 
-TIMEOUTS_TO_REOPEN = 2  # consecutive timeouts after which the sensor is reopened
+TIMEOUTS_TO_REOPEN = 2  # the sensor is reopened after this number of consecutive timeouts
 REOPEN_AFTER_S, REOPEN_AFTER_MAX_S = 0.25, 0.5  # delay before a lost sensor is reopened; doubles up to the maximum
 OPEN_TIMEOUT_S = 10.0  # a longer attempt to open the sensor is abandoned and repeated
-HANG_MARGIN_S = 0.5  # time after the timeout of a read at which the read counts as hung
+HANG_MARGIN_S = 0.5  # a read counts as hung this long after its timeout
 ABANDONED_MAX = 8  # maximum number of abandoned threads
-QUEUE_MAX = 1024  # maximum number of queued samples: four seconds of the fastest sensor
+QUEUE_MAX = 1024  # maximum number of queued samples: four seconds with the fastest sensor
 PICTURES_MAX = 8  # maximum number of queued samples with pictures
-AHEAD_NS = NS_PER_S // 1000  # a capture time that is later than the arrival by more than this is on another clock
-BEHIND_NS = 60 * NS_PER_S  # a capture time that is earlier than the arrival by more than this is on another clock
-FROZEN_NS = 2 * NS_PER_S  # data that stay identical for a longer time are a fault, because real data have noise
-COMPARED = slice(None, None, 4)  # rows and columns of a picture that are compared
+AHEAD_NS = NS_PER_S // 1000  # a capture time more than this after the arrival is on another clock
+BEHIND_NS = 60 * NS_PER_S  # a capture time more than this before the arrival is on another clock
+FROZEN_NS = 2 * NS_PER_S  # data that stay identical for longer are a fault, because real data have noise
+COMPARED = slice(None, None, 4)  # rows and columns of each picture to compare
 
 log = logging.getLogger(__name__)
 
 
 class SensorState(StrEnum):
-    """State of the connection to a sensor."""
+    """State of the sensor connection."""
 
     OPENING = "opening"
     RUNNING = "running"
     STALLED = "stalled"  # open, but delivers no samples
     LOST = "lost"  # closed, and will be reopened
-    HUNG = "hung"  # a call into the SDK does not return; another attempt follows
+    HUNG = "hung"  # an SDK call does not return; another attempt follows
     ENDED = "ended"  # the recording has ended
     FAILED = "failed"  # failed permanently; no retry follows
     STOPPED = "stopped"
 
 
 class _Attempt:
-    """Thread that runs one driver. The results of the thread are ignored once `abandoned` is set."""
+    """Thread that runs one driver. Its results are ignored once `abandoned` is set."""
 
     def __init__(self, number: int, run: Callable[[_Attempt], None], *, wait_s: float, deadline_ns: int) -> None:
         """Start the thread. Raises TransientError if the system cannot create a thread.
 
         Args:
-            number: Number of the attempt, for the name of the thread.
+            number: Attempt number, for the thread's name.
             run: Function that the thread calls with this attempt.
             wait_s: Time to wait before the sensor is opened.
-            deadline_ns: Time after which the thread counts as hung. Each step of the thread sets a new deadline.
+            deadline_ns: The thread counts as hung after this time. Each of its steps sets a new deadline.
         """
         self.number, self.abandoned = number, threading.Event()
         self.wait_s, self.deadline_ns = wait_s, deadline_ns
@@ -69,7 +69,7 @@ class _Attempt:
 
 
 class SensorWorker(Samples):
-    """Source of samples that runs a driver in a separate thread. No method except `close` blocks."""
+    """Sample source that runs a driver in a separate thread. No method except `close` blocks."""
 
     def __init__(
         self,
@@ -84,7 +84,7 @@ class SensorWorker(Samples):
 
         Args:
             make_driver: Function that creates a driver without opening it.
-            settings: Settings of the sensor, which contain the timeout of a read.
+            settings: Sensor settings, including the timeout for a read.
             clock: The run's clock.
             make_find: Function that creates the eye finder, for drivers that do not find eyes themselves.
             keep_images: Keep the pictures in samples after the eyes have been found.
@@ -96,12 +96,12 @@ class SensorWorker(Samples):
         self._attempt: _Attempt | None = None
         self._hung: list[_Attempt] = []
         self._state, self.reason = SensorState.STOPPED, ""
-        self._was_well = False  # True after the first valid sample
-        self._delivered: dict[str, tuple[int, int]] = {}  # checksum of the data, and time of the last change
+        self._was_well = False  # True once the first valid sample has arrived
+        self._delivered: dict[str, tuple[int, int]] = {}  # checksum and time of the last change, by kind of data
         self._untimely = ""  # description of the latest implausible capture time
         self._skipped = 0  # number of samples replaced by newer ones, except those that the current driver counts
         self._driver: Sensor | None = None
-        self.serial = ""  # serial number of the opened device, used to reopen the same device
+        self.serial = ""  # the opened device's serial number, used to reopen the same device
         self.error: FatalError | None = None
 
     def start(self) -> None:
@@ -140,7 +140,7 @@ class SensorWorker(Samples):
 
     @property
     def state(self) -> SensorState:
-        """State of the sensor. `reason` explains this state."""
+        """The sensor's state. `reason` explains it."""
         self._watch()
         return self._state
 
@@ -150,7 +150,7 @@ class SensorWorker(Samples):
 
     @property
     def capabilities(self) -> Capabilities | None:
-        """Capabilities of the driver, or None while no driver is open."""
+        """The driver's capabilities, or None while no driver is open."""
         return self._driver.capabilities if self._driver else None
 
     def close(self, timeout_s: float = 1.0) -> None:
@@ -162,7 +162,7 @@ class SensorWorker(Samples):
         self._state, self.reason = SensorState.STOPPED, ""
 
     def _watch(self) -> None:
-        """If a call of the sensor thread takes too long, abandon the thread and start another one."""
+        """Abandon the sensor thread and start another one if a call in the thread takes too long."""
         if not self._watching.acquire(blocking=False):
             return  # another thread is already doing this
         try:
@@ -193,7 +193,7 @@ class SensorWorker(Samples):
                 self._state, self.reason = state, reason
 
     def _account(self, driver: Sensor | None) -> None:
-        """Add the number of samples that a driver has skipped to the total, before the driver is discarded."""
+        """Add the number of samples skipped by a driver to the total, before the driver is discarded."""
         with self._lock:
             if driver is not None and driver is self._driver:
                 self._skipped += driver.skipped
@@ -286,7 +286,7 @@ class SensorWorker(Samples):
             well_ns, self._was_well = now_ns, True
             if not driver.capabilities.may_pause:
                 self._check_changing(frames[-1], now_ns)
-            # Find eyes only in the newest frame, because this takes as long as the period of a camera.
+            # Find eyes only in the newest frame, because doing so takes as long as a camera's frame period.
             overtaken = 0 if find is None else len(frames) - 1
             frames = [searched(frame, find, keep_images=self._keep_images) for frame in frames[overtaken:]]
             attempt.received += 1
@@ -315,10 +315,10 @@ class SensorWorker(Samples):
         return timely
 
     def _check_changing(self, frame: SensorFrame, now_ns: int) -> None:
-        """Check that the data of the sensor change.
+        """Check that the sensor's data keep changing.
 
-        Missing eye points and depth pictures without any measurement are not a fault. Raises SensorLost if pictures or
-        eye points have stayed identical for more than `FROZEN_NS`.
+        Missing eye points, and depth pictures without any measurements, are not faults. Raises SensorLost if pictures
+        or eye points have stayed identical for more than `FROZEN_NS`.
         """
         compared = {
             "picture has": None if frame.colour is None else frame.colour[COMPARED, COMPARED],

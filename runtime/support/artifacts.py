@@ -25,7 +25,7 @@ STAGING = ".phasestack-staging-"
 
 
 def sync(path: Path) -> None:
-    """Sync the data of a file or the entries of a folder to disk. Raises OSError if syncing fails."""
+    """Sync a file's data or a folder's entries to disk. Raises OSError if syncing fails."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -45,8 +45,8 @@ def write_bytes(path: Path, data: bytes, *, like: Path | None = None) -> None:
 
     Args:
         path: File to create or replace.
-        data: Content of the file.
-        like: Existing file whose owner and mode are copied. By default, owner and mode of a replaced file are kept.
+        data: The file's content.
+        like: Existing file whose owner and mode are copied. By default, a replaced file's owner and mode are kept.
 
     Raises:
         InputError: The file cannot be written.
@@ -92,7 +92,7 @@ def to_json(value: Any) -> str:
 
 
 def _listed(item: Any) -> Any:
-    """Convert NumPy arrays and scalars for the JSON encoder, which does not know them."""
+    """Convert NumPy arrays and scalars for the JSON encoder, which does not support them."""
     if isinstance(item, np.ndarray | np.generic):
         return item.tolist()
     raise TypeError(f"objects of type {type(item).__name__} cannot be written as JSON")
@@ -136,9 +136,9 @@ def write_png(path: Path, image: U8) -> None:
 class OutputFolder:
     """Output folder whose new files appear all at once at the end, or not at all.
 
-    Use the class as a context manager, and write the files to `staging`. On success, all files are moved to `target`
-    and replace files of the same names. If the block raises an exception, no new file remains. If a process is killed,
-    the next process that writes to the folder removes the staged files.
+    Use the class as a context manager, and write the files to `staging`. On success, all files are moved to `target`,
+    replacing any files of the same names. If the block raises an exception, no new files remain. If a process is
+    killed, the next process that writes to the folder removes its staged files.
     """
 
     def __init__(self, target: Path) -> None:
@@ -169,7 +169,7 @@ class OutputFolder:
         for folder in self._made:
             if folder.is_dir() and not any(folder.iterdir()):
                 folder.rmdir()
-        # In messages, name the final file instead of the staged file.
+        # In messages, name the final file instead of the staged one.
         if isinstance(error, InputError) and error.source.startswith(str(self.staging)):
             file = self.target / Path(error.source).relative_to(self.staging)
             raise InputError(file, error.field, error.problem) from None
@@ -179,8 +179,8 @@ class OutputFolder:
     def _put_in_place(self) -> None:
         """Move all staged files to the target folder.
 
-        Raises InputError if a file cannot be moved. Before the first file is moved, all destinations are checked for
-        obstacles.
+        Raises InputError if a file cannot be moved. All destinations are checked for obstacles before the first file is
+        moved.
         """
         files = sorted(path for path in self.staging.rglob("*") if path.is_file())
         places = {path: self.target / path.relative_to(self.staging) for path in files}
@@ -206,9 +206,9 @@ class OutputFolder:
 
 
 def _sweep(target: Path) -> None:
-    """Remove the staging folders of killed processes.
+    """Remove killed processes' staging folders.
 
-    The folder of a living process is locked. Unlike a check of process IDs, the lock also works across namespaces.
+    A live process holds a lock on its folder. Unlike checking process IDs, this also works across namespaces.
     """
     for stale in target.glob(f"{STAGING}*"):
         with suppress(OSError):
@@ -224,8 +224,8 @@ def _check_free(place: Path, *, within: Path) -> None:
     """Raise InputError if a folder exists where a file must go, or a file where a folder must go.
 
     Args:
-        place: Final path of a file.
-        within: Output folder, which contains `place` and is not checked.
+        place: A file's final path.
+        within: Output folder that contains `place`. This folder is not checked.
     """
     for folder in place.parents:
         if folder == within:
@@ -238,7 +238,7 @@ def _check_free(place: Path, *, within: Path) -> None:
 
 @contextmanager
 def held_back() -> Iterator[None]:
-    """Suppress output that libraries write to the file descriptor of stderr within the block.
+    """Suppress anything that libraries write to stderr's file descriptor within the block.
 
     If other threads are running, nothing is suppressed, because the descriptor belongs to the whole process.
     """

@@ -1,4 +1,4 @@
-"""Background threads and jobs with priorities: first the presenter, then the solver, then the rest."""
+"""Background threads and jobs, by priority: first the presenter, then the solver, then the rest."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from runtime.errors import PhasestackError, TransientError, one_line
 log = logging.getLogger("phasestack.background")
 
 PRESENTER_NICENESS = -10  # used if realtime priority is not allowed
-REALTIME_PRIORITY = 1  # lowest realtime priority, which still precedes every ordinary thread
+REALTIME_PRIORITY = 1  # lowest realtime priority, which still takes precedence over every ordinary thread
 SOLVER_NICENESS = 5
 BACKGROUND_NICENESS = 10
 MEASURING_NICENESS = 15  # for measurements and file output, which are not urgent
-# Time limit for waits after a stop request. The rest of two seconds is left for calls that have no timeout.
+# Time limit for waits after a stop request. The rest of the two seconds is left for calls without a timeout.
 STOPS_WITHIN_S = 1.2
 T = TypeVar("T")
 
@@ -30,7 +30,7 @@ _abandoned: set[threading.Thread] = set()
 
 
 def ends_by(at_s: float) -> None:
-    """Set a deadline in seconds of `time.monotonic`, which limits all later results of `patience_s`."""
+    """Set a deadline, in `time.monotonic` seconds, that limits all later results of `patience_s`."""
     global _ends_by_s
     _ends_by_s = at_s
 
@@ -41,7 +41,7 @@ def patience_s(most_s: float) -> float:
 
 
 def wait_for_all(timeout_s: float) -> int:
-    """Wait up to `timeout_s` for all running jobs, and return the number of unfinished jobs."""
+    """Wait up to `timeout_s` for all running jobs, and return the number of jobs still unfinished."""
     deadline_s = time.monotonic() + patience_s(timeout_s)
     for thread in tuple(_running):
         thread.join(max(0.0, deadline_s - time.monotonic()))
@@ -70,8 +70,8 @@ def abandon(thread: threading.Thread) -> None:
 def raise_if_abandoned() -> None:
     """Raise ThreadAbandoned if the calling thread has been abandoned.
 
-    Background work calls this function between operations such as drawing. An asynchronous exception is no alternative,
-    because it could arrive during a call to moderngl, which would crash.
+    Background work calls this function between operations such as drawing. An asynchronous exception is not an
+    alternative, because it could arrive during a call to moderngl, which would then crash.
     """
     if _abandoned and threading.current_thread() in _abandoned:
         raise ThreadAbandoned
@@ -95,12 +95,12 @@ class BackgroundJob(Generic[T]):
             self.problem, self.done = str(error), True
 
     def wait(self, timeout_s: float) -> None:
-        """Wait for the end of the job, for at most `timeout_s` and not beyond the deadline of `ends_by`."""
+        """Wait for the job to end, for at most `timeout_s` and not beyond the deadline set by `ends_by`."""
         if self._thread is not None:
             self._thread.join(patience_s(timeout_s))
 
     def take(self) -> T | None:
-        """Return the result once. Before the job is done and after the result was taken, return None."""
+        """Return the result once. Returns None before the job is done and after the result has been taken."""
         result, self._result = self._result, None
         return result
 
@@ -111,7 +111,7 @@ class BackgroundJob(Generic[T]):
             self._result = self._work()
         except PhasestackError as error:
             self.problem = str(error)
-        except BaseException as error:  # includes SystemExit, which the code of a vendor may raise
+        except BaseException as error:  # includes SystemExit, which a vendor's code may raise
             self.problem = one_line(f"{self._name}: {type(error).__name__}: {error}")
             log.exception("%s", self._name)
         finally:
@@ -121,10 +121,10 @@ class BackgroundJob(Generic[T]):
 
 @contextmanager
 def before_all_others() -> Iterator[None]:
-    """Give the calling thread realtime priority within the block, or a low niceness if not allowed.
+    """Give the calling thread realtime priority within the block or, if not allowed, a low niceness.
 
     At ordinary priority, the kernel lets a busy thread finish its time slice first, which would delay a refresh by up
-    to 3 ms. Threads and processes that are started within the block have ordinary priority.
+    to 3 ms. Threads and processes started within the block have ordinary priority.
     """
     policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
     before = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
@@ -140,12 +140,12 @@ def before_all_others() -> Iterator[None]:
 
 
 def set_niceness(niceness: int, thread: threading.Thread | None = None) -> None:
-    """Set the niceness of a thread and of all threads that it starts later.
+    """Set the niceness of a thread and of any threads it starts later.
 
-    Nothing happens if the system does not allow the change.
+    Has no effect if the system does not allow the change.
 
     Args:
-        niceness: Niceness from -20 to 19. A lower value has precedence.
+        niceness: Niceness from -20 to 19. Lower values take precedence.
         thread: Thread to change, by default the calling thread.
     """
     with suppress(OSError):

@@ -44,18 +44,19 @@ def in_child(
 ) -> T:
     """Call `work(*args)` in a child process and return the result.
 
-    An exception in the listener of this thread's progress (`progress.listening`) kills the child and propagates.
+    If this thread's progress listener (`progress.listening`) raises an exception, the child is killed and the exception
+    propagates.
 
     Args:
         work: Function at the top level of a module.
-        args: Arguments that can be pickled.
+        args: Arguments for `work`. They must be picklable.
         source: File to name in messages.
         seconds: Time limit.
         memory_bytes: Memory limit, by default `MEMORY_MAX`.
 
     Raises:
         PhasestackError: `work` raised this error.
-        InputError: `work` exceeded a limit, raised another exception or ended the process.
+        InputError: `work` exceeded a limit, raised any other exception, or ended the process.
         TransientError: No process can be started.
     """
     memory_bytes = memory_bytes or MEMORY_MAX
@@ -94,7 +95,7 @@ def in_child(
 
 
 def _outcome(channel: Connection, source: str, seconds: float) -> tuple[bytes, list[int]] | None:
-    """Wait for the child's result, and forward progress, log lines and errors.
+    """Wait for the child's result, forwarding its progress, log lines and errors.
 
     Returns the pickled result and the sizes of its arrays in bytes, or None if the child ended without a result.
     """
@@ -119,9 +120,9 @@ def _outcome(channel: Connection, source: str, seconds: float) -> tuple[bytes, l
 
 
 def _mapped(memory: int, sizes: list[int]) -> list[memoryview | bytearray]:
-    """Return the arrays in the shared memory, mapped copy-on-write.
+    """Return the arrays in shared memory, mapped copy-on-write.
 
-    Small arrays are copied. Otherwise, a small array that is kept would keep the whole mapping alive.
+    Small arrays are copied, because keeping a small array would otherwise keep the whole mapping alive.
     """
     total = sum(map(_room, sizes))
     whole = memoryview(mmap.mmap(memory, total, flags=mmap.MAP_PRIVATE) if total else b"")
@@ -135,7 +136,7 @@ def _room(size: int) -> int:
 
 
 class _Forwarded(logging.Handler):
-    """Handler that sends the log records of the child to the parent process."""
+    """Handler that sends the child's log records to the parent process."""
 
     def __init__(self, channel: Connection) -> None:
         super().__init__()
@@ -150,7 +151,7 @@ def main(channel: Connection, memory: int) -> None:
 
     Args:
         channel: Connection to the parent.
-        memory: File descriptor of the shared memory for the arrays of the result.
+        memory: File descriptor of the shared memory for the result's arrays.
     """
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # end when the parent ends
     work, args, source, limits, (memory_bytes, seconds) = channel.recv()
@@ -162,7 +163,7 @@ def main(channel: Connection, memory: int) -> None:
         (resource.RLIMIT_CPU, processor_s),
         (resource.RLIMIT_CORE, 0),
     ):
-        hard = resource.getrlimit(kind)[1]  # inherited limit, which this process may itself have got as a child
+        hard = resource.getrlimit(kind)[1]  # inherited limit, in case the parent is itself such a child
         most = most if hard == resource.RLIM_INFINITY else min(most, hard)
         resource.setrlimit(kind, (most, most))
     with suppress(OSError):
@@ -197,9 +198,9 @@ def main(channel: Connection, memory: int) -> None:
 
 
 def _passing(error: BaseException | None) -> OSError | None:
-    """Return the transient system error that caused an error of the project, for `is_retryable`, or None.
+    """Return the transient system error that caused a project error, for `is_retryable`, or None.
 
-    If the cause is a MemoryError, the process has reached its memory limit and ends.
+    If the cause is a MemoryError, the process has reached its memory limit, so it ends.
     """
     while error is not None:
         if isinstance(error, MemoryError):

@@ -10,27 +10,27 @@ import numpy as np
 from runtime.records import F64
 
 NCLX = re.compile(rb"colrnclx(..)(..)", re.DOTALL)
-SEARCHED = 1 << 18  # number of bytes at the beginning of a file that are searched for the colour codes
-PQ, HLG = 16, 18  # codes of transfer characteristics; all other codes are treated as sRGB
-PAPER_NITS, PQ_NITS = 203.0, 10_000.0  # luminance of white (ITU-R BT.2408), and maximum luminance of PQ
-PRIMARIES = {  # XYZ of red, green and blue by code, adapted to D50; code 1 (BT.709) has the primaries of sRGB
+SEARCHED = 1 << 18  # number of bytes at the beginning of a file to search for the colour codes
+PQ, HLG = 16, 18  # transfer characteristics codes; all other codes are treated as sRGB
+PAPER_NITS, PQ_NITS = 203.0, 10_000.0  # white's luminance (ITU-R BT.2408), and PQ's maximum luminance
+PRIMARIES = {  # XYZ of red, green and blue, keyed by code and adapted to D50; code 1 (BT.709) has sRGB's primaries
     1: ((0.43607, 0.22249, 0.01392), (0.38515, 0.71687, 0.09708), (0.14307, 0.06061, 0.71410)),
     9: ((0.67348, 0.27905, -0.00193), (0.16566, 0.67534, 0.02998), (0.12505, 0.04561, 0.79686)),
     12: ((0.51512, 0.24120, -0.00105), (0.29198, 0.69225, 0.04189), (0.15710, 0.06657, 0.78407)),
 }
 D50 = (0.9642, 1.0, 0.8249)
-SRGB_CURVE = (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)  # parameters g, a, b, c, d of an ICC curve
-SAMPLES = 4096  # number of samples of a transfer curve
+SRGB_CURVE = (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)  # an ICC curve's parameters g, a, b, c, d
+SAMPLES = 4096  # number of samples in a transfer curve
 
 
 def stated_profile(coded: bytes) -> bytes:
     """Return the ICC profile for a picture's declared colours.
 
     Args:
-        coded: Encoded picture, of which the beginning is sufficient.
+        coded: Encoded picture. Its beginning is sufficient.
 
     Returns:
-        ICC profile, or empty bytes if the picture declares no colours, sRGB or unknown colours.
+        The ICC profile, or empty bytes if the picture declares no colours, sRGB or unknown colours.
     """
     found = NCLX.search(coded[:SEARCHED]) if coded[4:8] == b"ftyp" else None
     if found is None:
@@ -56,7 +56,7 @@ def _fixed(*values: float) -> bytes:
 
 
 def _table(transfer: int) -> bytes:
-    """Return an ICC curve from codes to light relative to paper white. Brighter light is clipped."""
+    """Return an ICC curve that maps codes to light relative to paper white. Brighter light is clipped."""
     code = np.linspace(0.0, 1.0, SAMPLES)
     light = _pq(code) if transfer == PQ else _hlg(code) / _hlg(np.array(0.75))  # the HLG code of paper white is 0.75
     values = np.rint(np.clip(light, 0.0, 1.0) * 65535).astype(">u2")

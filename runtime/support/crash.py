@@ -21,9 +21,9 @@ KEPT = 20  # maximum number of reports; a service that fails repeatedly must not
 
 
 def written(error: BaseException) -> str:
-    """Write a report of an exception to a file, and return a line for the user that names the file.
+    """Write an exception report to a file, and return a line for the user that names the file.
 
-    If no file can be written, the line says so. The function never raises an exception.
+    If no file can be written, the line says so. Never raises an exception.
     """
     from runtime.support.version import version
 
@@ -37,7 +37,7 @@ def written(error: BaseException) -> str:
     for folder in (state_folder(), Path(tempfile.gettempdir())):
         with contextlib.suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)
-            # Only the owner can read a file from mkstemp. The report may contain private paths and names.
+            # The report may contain private paths and names. A file created by mkstemp can be read only by its owner.
             file, path = tempfile.mkstemp(".log", f"{STEM}{now:%Y%m%dT%H%M%S}-{os.getpid()}-", folder)
             try:
                 with os.fdopen(file, "w", encoding="utf-8", errors="backslashreplace") as opened:
@@ -53,7 +53,7 @@ def written(error: BaseException) -> str:
 
 
 def watch_threads() -> None:
-    """Install hooks that report exceptions that end a thread or that Python cannot raise."""
+    """Install hooks that report exceptions that end a thread, or that Python cannot raise."""
     threading.excepthook = lambda hook: _say(hook.exc_value, hook.exc_type)
     sys.unraisablehook = lambda hook: _say(hook.exc_value, hook.exc_type)
 

@@ -1,4 +1,4 @@
-"""Find the extra of phasestack that installs a missing optional package."""
+"""Find the phasestack extra that installs a missing optional package."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from importlib.metadata import PackageNotFoundError, requires
 
 from runtime.errors import MissingPart
 
-IMPORTED_AS = {"usb": "pyusb"}  # packages whose module has a different name
+IMPORTED_AS = {"usb": "pyusb"}  # packages whose modules have different names
 NOT_TO_RUN = frozenset({"all", "docs", "test"})  # extras that are never suggested to a user
 
 
 def missing_extra(error: BaseException) -> MissingPart | None:
-    """Return an error that names the extra to install, for an import that failed.
+    """Return an error that names the extra to install after an import has failed.
 
-    The result is None if the import failed for another reason or if no extra contains the package.
+    Returns None if the import failed for another reason, or if no extra contains the package.
     """
     if not isinstance(error, ModuleNotFoundError) or not error.name:
         return None

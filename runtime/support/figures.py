@@ -1,4 +1,4 @@
-"""Format the results of commands as readable lines, with the same names of fields as in JSON."""
+"""Format the results of commands as readable lines, with the same field names as in JSON."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ LINE_MAX = 2000  # maximum number of characters in a line
 
 
 def shown(record: Mapping[str, Any], *, as_json: bool) -> str:
-    """Format the result of a command as JSON or as readable lines."""
+    """Format a command's result as JSON or as readable lines."""
     return json.dumps(record) if as_json else "\n".join(lines_of(record))
 
 
 def lines_of(record: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a line for each field of a record. A list of objects gives a line for each object.
+    """Yield one line per field in a record. A list of objects gives one line per object.
 
     Fields whose value is null, false or empty are skipped. Line breaks within values are replaced.
     """

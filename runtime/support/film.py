@@ -19,9 +19,9 @@ _alone = threading.Lock()
 def open_film(path: Path) -> cv2.VideoCapture:
     """Open a film.
 
-    FFmpeg is restricted to local files and video containers. Otherwise, a playlist or script with the suffix of a film,
-    or a name that looks like a URL, could make FFmpeg open other files and network connections. Messages of FFmpeg and
-    OpenCV are suppressed, because they do not name the file as the project's own errors do.
+    FFmpeg is restricted to local files and video containers. Otherwise, a playlist or script with a film's suffix, or a
+    name that looks like a URL, could make FFmpeg open other files and network connections. Messages from FFmpeg and
+    OpenCV are suppressed because, unlike the project's own errors, they do not name the file.
 
     Raises InputError if the path is not a regular file or the file cannot be read.
     """

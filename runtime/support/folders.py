@@ -1,4 +1,4 @@
-"""Folder for data that is kept between runs."""
+"""Folder for data kept between runs."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from pathlib import Path
 
 
 def state_folder() -> Path:
-    """Return the state folder of the systemd service or, if not run as a service, of the user.
+    """Return the systemd service's state folder or, if not run as a service, the user's.
 
-    Without a home folder, the result is a folder among the temporary files.
+    If there is no home folder, returns a folder among the temporary files.
     """
     if service := os.environ.get("STATE_DIRECTORY", ""):
         return Path(service.split(":")[0])

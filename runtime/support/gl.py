@@ -1,4 +1,4 @@
-"""Offscreen OpenGL contexts through EGL. Mesa's software renderer (llvmpipe) is sufficient."""
+"""Offscreen OpenGL contexts created through EGL. Mesa's software renderer (llvmpipe) is sufficient."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ if TYPE_CHECKING:
 
 DEBIAN_PACKAGES = "libegl1 libgl1-mesa-dri libgles2 libgl1"
 MINIMUM_VERSION = 330  # OpenGL 3.3, which the shaders require
-# File names spare moderngl a search for the libraries, which starts a compiler and takes 60 ms.
+# Given these file names, moderngl need not search for the libraries; a search starts a compiler and takes 60 ms.
 EGL: dict[str, Any] = {"backend": "egl", "libegl": "libEGL.so.1", "libgl": "libGL.so.1"}
 
 
 def offscreen_context() -> moderngl.Context:
     """Create an offscreen OpenGL context for content and offscreen panels, and make it current.
 
-    Use the context on one thread only. Raises MissingPart, with the names of Debian's packages, if EGL does not provide
-    OpenGL 3.3.
+    Use the context on one thread only. Raises MissingPart, which names the Debian packages to install, if EGL does not
+    provide OpenGL 3.3.
     """
     try:
         import moderngl
@@ -44,7 +44,7 @@ def offscreen_context() -> moderngl.Context:
 
 
 def leave_context() -> None:
-    """Detach the current context from this thread. A context that is released while current would leak."""
+    """Detach the current context from this thread. Releasing a context while it is current would leak it."""
     egl, pointer = ctypes.CDLL(EGL["libegl"]), ctypes.c_void_p
     egl.eglGetCurrentDisplay.restype, egl.eglMakeCurrent.argtypes = pointer, [pointer] * 4
     egl.eglMakeCurrent(egl.eglGetCurrentDisplay(), None, None, None)
@@ -56,10 +56,10 @@ def _gl_finish() -> Any:
 
 
 def finish() -> None:
-    """Wait until the OpenGL commands of this thread are complete, without holding Python's global lock.
+    """Wait until this thread's OpenGL commands are complete, without holding Python's global lock.
 
-    Calls of moderngl hold the lock. Reading a picture that a software rasteriser is still drawing would block all other
-    threads for tens of milliseconds.
+    Calls to moderngl hold the lock. If one of them read a picture that a software rasteriser was still drawing, all
+    other threads would be blocked for tens of milliseconds.
     """
     _gl_finish()()
 
@@ -70,18 +70,18 @@ class DrawnPicture:
 
     texture: moderngl.Texture
     target: moderngl.Framebuffer  # framebuffer with `texture` attached
-    held: U8  # (h, w, 4) buffer of the renderer into which `pixels` reads
+    held: U8  # (h, w, 4) the renderer's buffer that `pixels` reads into
     grey: bool = False  # True if the picture is known to have no colour
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Shape of the pixels, (h, w, 4)."""
+        """Shape of the pixel array, (h, w, 4)."""
         return self.held.shape
 
     def pixels(self) -> U8:
-        """Read back the pixels, shape (h, w, 4). The returned array is valid until the next drawing.
+        """Read back the pixels, shape (h, w, 4). The array stays valid until the next picture is drawn.
 
-        Call this method on the thread of the context.
+        Call this method on the context's thread.
         """
         finish()
         self.target.read_into(self.held, components=4)
@@ -89,6 +89,6 @@ class DrawnPicture:
 
 
 def describe(context: moderngl.Context) -> dict[str, str]:
-    """Return the vendor, renderer and version that the OpenGL driver reports."""
+    """Return the vendor, renderer and version reported by the OpenGL driver."""
     info = context.info
     return {"vendor": str(info["GL_VENDOR"]), "renderer": str(info["GL_RENDERER"]), "version": str(info["GL_VERSION"])}

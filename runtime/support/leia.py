@@ -1,8 +1,8 @@
-"""Find the second view of a Leia picture (LIF, from a Lume Pad), which is a JPEG followed by fields.
+"""Find the second view in a Leia picture (LIF, from a Lume Pad), which is a JPEG followed by fields.
 
-The file ends with the total length of the fields and a marker. The fields begin with the number of fields. Each field
-consists of an identifier, a size and data. One field describes the views in JSON: it contains the position of each view
-and the identifier of the field with the view's JPEG. The identifier -1 denotes the JPEG at the start of the file.
+The file ends with the fields' total length and a marker. The number of fields comes before the fields themselves. Each
+field consists of an identifier, a size and data. One field describes the views in JSON: it gives each view's position
+and the identifier of the field that holds the view's JPEG. The identifier -1 denotes the JPEG at the start of the file.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from runtime.errors import InputError
 from runtime.support.untrusted_input import parsed_json
 
 MARK = b"\x1e\x1a"
-VIEWS, OWN = 7, -1  # field identifiers of the JSON that describes the views, and of the JPEG at the start of the file
+VIEWS, OWN = 7, -1  # field identifiers for the JSON that describes the views, and for the JPEG at the start of the file
 JSON_BYTES_MAX = 65536
 
 
 def other_view(file: IO[bytes]) -> tuple[slice, bool] | None:
-    """Find the second JPEG of a Leia picture.
+    """Find the second JPEG in a Leia picture.
 
     Args:
-        file: Open file, whose position changes.
+        file: Open file. Its position changes.
 
     Returns:
-        The range of bytes of the second JPEG, and True if this JPEG is the left eye's picture. None for other files.
+        The second JPEG's byte range, and True if this JPEG is the left eye's picture. None for other files.
     """
     size = file.seek(0, 2)
     if size < 6:

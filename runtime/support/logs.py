@@ -1,7 +1,7 @@
 """Logging to a terminal or to journald.
 
-Repeated messages are rate-limited, a message with line breaks cannot forge other log lines, and a slow reader of the
-lines never blocks the program.
+Repeated messages are rate-limited, messages with line breaks cannot forge other log lines, and a slow reader of the log
+never blocks the program.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from runtime.clock import NS_PER_S, Clock, MonotonicClock
 from runtime.errors import one_line
 from runtime.support.crash import written
 
-# Prefixes of sd-daemon(3) that set a line's priority in journald.
+# Prefixes from sd-daemon(3) that set a line's priority in journald.
 PRIORITY = {
     logging.DEBUG: "<7>",
     logging.INFO: "<6>",
@@ -30,17 +30,17 @@ PRIORITY = {
     logging.ERROR: "<3>",
     logging.CRITICAL: "<2>",
 }
-ROOTS = ("phasestack", "runtime")  # parents of the loggers named by subject, and of the loggers named by module
+ROOTS = ("phasestack", "runtime")  # parents of the loggers named by subject and of those named by module
 BURST = 5  # number of identical messages that pass within `QUIET_NS`
-REMEMBERED = 1000  # maximum number of different messages that are counted
-QUIET_NS = 30 * NS_PER_S  # time after which a suppressed message passes again
-QUEUED_MAX = 4096  # maximum number of lines that wait for a reader
+REMEMBERED = 1000  # maximum number of different messages to count
+QUIET_NS = 30 * NS_PER_S  # a suppressed message passes again after this time
+QUEUED_MAX = 4096  # maximum number of lines waiting for a reader
 CLOSE_S = 1.0  # time limit for writing the last lines
 LINE_MAX = 4000  # maximum number of characters in a line
 
 
 class TextFormat(logging.Formatter):
-    """Formatter that starts each line with time and level or, for journald, with a priority.
+    """Formatter that starts each line with the time and level or, for journald, with a priority.
 
     Journald adds the time itself.
     """
@@ -52,7 +52,7 @@ class TextFormat(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         text = one_line(record.getMessage(), most=LINE_MAX)  # prevents forged lines
         if record.exc_info and record.exc_info[1]:
-            text += f": {written(record.exc_info[1])}"  # the text names the file with the traceback
+            text += f": {written(record.exc_info[1])}"  # the text names the file that contains the traceback
         if self._journald:
             return PRIORITY.get(record.levelno, "<6>") + text
         when = datetime.fromtimestamp(record.created).strftime("%H:%M:%S")
@@ -62,8 +62,8 @@ class TextFormat(logging.Formatter):
 class RateLimit(logging.Filter):
     """Filter that passes at most five identical messages within 30 s.
 
-    The next message that passes states how many messages were suppressed. Records with `extra={"always": True}`, such
-    as changes of state, always pass.
+    The next message that passes states how many were suppressed. Records with `extra={"always": True}`, such as changes
+    of state, always pass.
     """
 
     def __init__(self, clock: Clock) -> None:
@@ -110,7 +110,7 @@ class _Lines(logging.Handler):
 
 
 class QueuedLines(QueueHandler):
-    """Handler that writes lines on a separate thread. If too many lines are waiting, it drops new lines."""
+    """Handler that writes lines on a separate thread. If too many lines are waiting, it drops new ones."""
 
     def __init__(self, descriptor: int, form: logging.Formatter) -> None:
         self.queue: queue.Queue[Any] = queue.Queue(QUEUED_MAX)
@@ -121,7 +121,7 @@ class QueuedLines(QueueHandler):
         self._listener.start()
 
     def prepare(self, record: logging.LogRecord) -> logging.LogRecord:
-        """Format the message, but leave the exception to the listener's thread, because that takes longer."""
+        """Format the message, but leave the exception to the listener's thread, because it takes longer."""
         prepared = copy.copy(record)
         prepared.msg, prepared.args = record.getMessage(), None
         return prepared
@@ -131,7 +131,7 @@ class QueuedLines(QueueHandler):
             self.queue.put_nowait(record)
 
     def flush(self) -> None:
-        """Wait up to `CLOSE_S` seconds until the queued lines are written."""
+        """Wait up to `CLOSE_S` seconds for the queued lines to be written."""
         deadline_s = time.monotonic() + CLOSE_S
         while self.queue.unfinished_tasks and time.monotonic() < deadline_s:
             time.sleep(0.005)
@@ -150,8 +150,8 @@ def configure(
 
     Args:
         stream: Stream for the log lines, by default stderr.
-        clock: Clock of the rate limit.
-        environment: Environment variables, from which a journald stream is recognized.
+        clock: Clock for the rate limit.
+        environment: Environment variables, used to detect a journald stream.
     """
     for old in logging.getLogger(ROOTS[0]).handlers[:]:
         if isinstance(old, QueuedLines):
@@ -167,9 +167,9 @@ def configure(
 
 
 def flush() -> None:
-    """Wait up to `CLOSE_S` seconds until the queued lines are written.
+    """Wait up to `CLOSE_S` seconds for the queued lines to be written.
 
-    Call this function before the process ends without clean-up.
+    Call this function before ending the process without clean-up.
     """
     for handler in logging.getLogger(ROOTS[0]).handlers:
         handler.flush()

@@ -8,9 +8,9 @@ import sys
 from functools import cache
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8  # constants from glibc's malloc.h
-LARGEST_KEPT = 32 << 20  # size in bytes of the largest block that is kept, the maximum that every glibc accepts
-MOST_KEPT = 1 << 30  # number of free bytes that are kept at the end of a heap
-ARENAS = 2  # number of heaps; the default is eight per processor, of which only the first returns memory
+LARGEST_KEPT = 32 << 20  # size in bytes of the largest block to keep, the maximum that every glibc accepts
+MOST_KEPT = 1 << 30  # number of free bytes kept at the end of a heap
+ARENAS = 2  # number of heaps; the default is eight per processor, but only the first returns memory
 
 
 def give_back() -> None:
@@ -23,9 +23,9 @@ def give_back() -> None:
 def keep_freed_memory() -> bool:
     """Make glibc's malloc keep large blocks for the next frame. Return False for other C libraries.
 
-    By default, malloc maps new memory for every picture, and the page faults on first use take a quarter of the time of
-    a prediction at 1920x1080. All threads share `ARENAS` heaps, because each heap keeps up to `MOST_KEPT` bytes. Call
-    this function before threads are started.
+    By default, malloc maps new memory for every picture, and the page faults on first use take up a quarter of a
+    prediction's time at 1920x1080. All threads share `ARENAS` heaps, because each heap keeps up to `MOST_KEPT` bytes.
+    Call this function before threads are started.
     """
     if sys.platform != "linux":
         return False

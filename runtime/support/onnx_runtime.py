@@ -1,4 +1,4 @@
-"""Import ONNX Runtime with telemetry disabled. No other module of `runtime` imports onnxruntime."""
+"""Import ONNX Runtime with telemetry disabled. No other module in `runtime` imports onnxruntime."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ from typing import Any
 
 @cache
 def onnxruntime() -> Any:
-    """Import and return onnxruntime. Telemetry is disabled by an environment variable and by a function."""
+    """Import and return onnxruntime with telemetry disabled.
+
+    Telemetry is disabled both by an environment variable and by a function call.
+    """
     os.environ["ORT_DISABLE_TELEMETRY"] = "1"
     import onnxruntime as ort
 

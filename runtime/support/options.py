@@ -11,13 +11,13 @@ import typer
 from runtime.errors import InputError
 from runtime.support.ranges import EYE_MOST_M, refusal
 
-OPTION_OF = {("content", "scene"): "scene", ("model", "name"): "model"}  # options that set a setting
+OPTION_OF = {("content", "scene"): "scene", ("model", "name"): "model"}  # options, keyed by the setting they set
 
 
 def number(low: float, high: float, unit: str = "", *, help: str) -> Any:
     """Return a typer option for numbers within a range.
 
-    Parsing raises InputError, which names the command and the option, for NaN and for numbers out of range.
+    For NaN and for numbers out of range, parsing raises an InputError that names the command and the option.
 
     Args:
         low: Smallest accepted number, finite.
@@ -35,11 +35,11 @@ def place(*, help: str) -> Any:
 
 @contextmanager
 def blame_option(command: str, **options: Any) -> Iterator[None]:
-    """Make an InputError in the block name the command-line option that set the faulty setting.
+    """Make any InputError raised in the block name the command-line option that set the faulty setting.
 
     Args:
-        command: Name of the command.
-        options: Values of the options in OPTION_OF by name. None: the option was not given.
+        command: Command name.
+        options: Values of the options in OPTION_OF, keyed by name. None: the option was not given.
     """
     try:
         yield

@@ -30,15 +30,15 @@ log = logging.getLogger("phasestack.pictures")
 
 Colour = tuple[float, float, float]  # sRGB components in [0, 1]
 WHITE: Colour = (1.0, 1.0, 1.0)
-ROWS_AT_ONCE = 64  # number of rows that are converted together, which bounds the memory
-LATTICE = 9  # number of values per channel at which a colour profile is compared with sRGB
-SRGB_CODES = 2  # maximum difference in code values for a profile to count as sRGB
-STILL_MS = 100.0  # duration of an animation frame that declares a duration of 0, as in browsers
+ROWS_AT_ONCE = 64  # number of rows converted together, to limit memory use
+LATTICE = 9  # a colour profile is compared with sRGB at this number of values per channel
+SRGB_CODES = 2  # a profile counts as sRGB if its code values differ by at most this
+STILL_MS = 100.0  # duration used for an animation frame that declares 0, as in browsers
 DEEP = {"I;16": "<u2", "I;16L": "<u2", "I;16B": ">u2", "I;16N": "=u2"}  # Pillow's 16-bit modes
 
 
 def read_image(path: Path, *, background: Colour = WHITE) -> U8:
-    """Read the first picture of a file as 8-bit sRGB, shape (h, w, 3).
+    """Read the first picture in a file as 8-bit sRGB, shape (h, w, 3).
 
     Args:
         path: Picture file.
@@ -52,9 +52,9 @@ def read_image(path: Path, *, background: Colour = WHITE) -> U8:
 
 
 def read_views(path: Path, *, background: Colour = WHITE) -> list[U8]:
-    """Read the left and right eye's pictures of a stereo pair, or a single picture from any other file.
+    """Read the left and right eye's pictures from a stereo pair, or a single picture from any other file.
 
-    Each picture has the format of `read_image`, which also documents the arguments and exceptions.
+    The pictures' format, the arguments and the exceptions are the same as for `read_image`.
     """
     data, header = read_coded(path)
     if header.warning:
@@ -68,7 +68,7 @@ def read_views(path: Path, *, background: Colour = WHITE) -> list[U8]:
 def read_animation(path: Path, *, background: Colour = WHITE) -> tuple[list[U8], list[float]]:
     """Read the frames of an animated picture, and the duration of each frame in milliseconds.
 
-    If the frames together have more pixels than a picture may have, only the first frame is read and a warning is
+    If all frames together have more pixels than one picture may have, only the first frame is read and a warning is
     logged. Raises InputError if the file cannot be read or decoded.
     """
     data, header = read_coded(path)
@@ -103,14 +103,14 @@ def _decoded(path: Path, data: bytes, frames: tuple[int, ...], background: Colou
                 yield rgb_of(image, path, background=background), shown_ms
     except InputError:
         raise
-    except Exception as error:  # each of Pillow's decoders raises its own exceptions
+    except Exception as error:  # the class of the exception depends on Pillow's decoder
         raise InputError(path, "", undecodable(data, error)) from None
 
 
 def rgb_of(image: Any, source: object, *, background: Colour = WHITE) -> U8:
     """Convert a decoded Pillow image to 8-bit sRGB, shape (h, w, 3).
 
-    The conversion applies the EXIF orientation and the colour profile of the image.
+    The conversion applies the image's EXIF orientation and colour profile.
 
     Args:
         image: Decoded Pillow image.
@@ -173,11 +173,11 @@ def _eight_bits(image: Any) -> Any:
 def _to_srgb(profile: bytes, colours: str, source: object) -> Any:
     """Return a function that converts images from a colour profile to sRGB.
 
-    The result is None if no conversion is needed, because the profile is broken or close to sRGB.
+    Returns None if no conversion is needed, because the profile is broken or close to sRGB.
 
     Args:
         profile: ICC profile.
-        colours: Mode of the Pillow images to convert: `L`, `RGB` or `CMYK`.
+        colours: Mode of the Pillow images to be converted: `L`, `RGB` or `CMYK`.
         source: File to name in messages.
     """
     try:

@@ -1,4 +1,4 @@
-"""Read the headers of picture files, and check them against the limits before decoding."""
+"""Read picture file headers, and check them against the limits before decoding."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from runtime.support.leia import other_view
 from runtime.support.untrusted_input import LIMITS
 
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
-PNG_DEPTH = slice(24, 25)  # position of the bit depth in a PNG
+PNG_DEPTH = slice(24, 25)  # where a PNG stores its bit depth
 CHUNK_BYTES = 12  # overhead of a PNG chunk: length, kind and checksum
 SIDE_MAX_PX = 1 << 16  # maximum width and height that a header may declare
 # Pillow's names of the supported formats. EPS is excluded, because Pillow would start Ghostscript. JPEG includes MPO.
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF", "PPM", "TGA", "AVIF")
 ANIMATED = ("GIF", "PNG", "WEBP", "AVIF")
 ORIENTATION = 0x0112  # EXIF tag
-TURNED = (5, 6, 7, 8)  # EXIF orientations with a quarter turn, which exchanges width and height
-MP_ENTRIES, MP_NUMBER = 0xB002, 0xB101  # MPO tags: list of pictures, and viewpoint of a picture (counted from the left)
+TURNED = (5, 6, 7, 8)  # EXIF orientations with a quarter turn, which swaps width and height
+MP_ENTRIES, MP_NUMBER = 0xB002, 0xB101  # MPO tags: list of pictures, and a picture's viewpoint (counted from the left)
 DISPARITY, UNDEFINED = "Multi-Frame Image: (Disparity)", "Undefined"
 JPS, JPS_BYTES = b"_JPSJPS_", 14  # marker and minimum length of a stereo header
 JPS_LAYOUTS = {2: "side-by-side", 3: "top-bottom", 4: "anaglyph"}
 JPS_HALF_HEIGHT, JPS_HALF_WIDTH, JPS_LEFT_FIRST = 1, 2, 4
-GAIN_MAP = (b"hdrgm", b"21496-1")  # markers of a gain map, a second picture that contains only brightness
-HEAD_BYTES = 512  # number of bytes at the beginning of a file that identify the file's kind
+GAIN_MAP = (b"hdrgm", b"21496-1")  # markers of a gain map, a second picture that holds only brightness
+HEAD_BYTES = 512  # number of bytes at the beginning of a file used to identify its kind
 UNDECODED = "is not an image that can be decoded"
 ANOTHER = "save it as PNG, JPEG or AVIF"
 CAMERA_SET = "such a scene is trained first; its splats (.ply) are drawn, and its folder of pictures as a slideshow"
@@ -75,18 +75,18 @@ class Header:
     is_around: bool = False  # True if the XMP data declare a full sphere (equirectangular projection)
     warning: str = ""  # warning for the user, such as a missing second view; empty: none
     layout: str = ""  # arrangement of two views in one picture, from a JPEG's stereo header; empty: none
-    other: slice | None = None  # range of bytes of the second view in a Leia picture
+    other: slice | None = None  # byte range of the second view in a Leia picture
 
 
 @contextmanager
 def opened(coded: bytes | IO[bytes]) -> Iterator[Any]:
     """Open a picture with Pillow without decoding the pixels, and yield the Pillow image.
 
-    Pillow's limits are disabled, because the callers apply stricter limits. Each of Pillow's formats raises exceptions
-    of different classes for invalid pictures.
+    Pillow's limits are disabled, because the callers apply stricter ones. For invalid pictures, the class of the
+    exception depends on the format.
 
     Args:
-        coded: Encoded picture or an open file.
+        coded: Encoded picture, as bytes or as an open file.
     """
     from PIL import Image
 
@@ -113,17 +113,17 @@ def _formats() -> tuple[str, ...]:
 
 
 def _header_of(path: Path, coded: bytes | IO[bytes]) -> Header:
-    """Read the header of a picture.
+    """Read a picture's header.
 
     Args:
-        path: Picture file. Only for the suffix .mpo, a second picture of undefined type counts as an eye's view.
-        coded: Content of the file, or the open file.
+        path: Picture file. A second picture of undefined type counts as an eye's view only if the suffix is .mpo.
+        coded: The file's content, or the open file.
 
     Raises:
         InputError: The file is a camera's raw picture, the header cannot be decoded, or the picture has too many
             pixels.
     """
-    if path.suffix.lower() in RAW:  # many raw files are TIFFs, of which Pillow would show only the thumbnail
+    if path.suffix.lower() in RAW:  # many raw files are TIFFs, and Pillow would show only their thumbnails
         raise InputError(path, "", "is {}, which is not supported: {}".format(*RAW_KIND))
     try:
         with opened(coded) as image:
@@ -137,7 +137,7 @@ def _header_of(path: Path, coded: bytes | IO[bytes]) -> Header:
                 other, views = found[0], (1, 0) if found[1] else (0, 1)
             kind = image.format
         head = _beginning(coded, HEAD_BYTES)
-    except Exception as error:  # each of Pillow's formats raises exceptions of different classes
+    except Exception as error:  # the class of the exception depends on Pillow's format
         raise InputError(path, "", undecodable(_beginning(coded, LIMITS.file_bytes), error)) from None
     check_size(width, height, source=path, head=head)
     return Header(kind, width, height, views, is_animated, is_around, warning, layout, other)
@@ -151,7 +151,7 @@ def _beginning(coded: bytes | IO[bytes], most_bytes: int) -> bytes:
 
 
 def _views(image: Any, *, is_named_so: bool) -> tuple[tuple[int, ...], str]:
-    """Find the frames that show the left and the right eye's view.
+    """Find the frames that show the left and right eye's views.
 
     A second picture counts as a view only if the file declares a stereo pair and both pictures have the same size.
 
@@ -160,7 +160,7 @@ def _views(image: Any, *, is_named_so: bool) -> tuple[tuple[int, ...], str]:
         is_named_so: Also accept an MPO whose second picture has an undefined type, because the file's suffix is .mpo.
 
     Returns:
-        Indices of the left and right frame, or the index of a single frame, and a warning, which may be empty.
+        The indices of the left and right frames, or the index of a single frame, and a warning, which may be empty.
     """
     shown = (image.tell(),)
     if image.format == "HEIF":
@@ -176,7 +176,7 @@ def _views(image: Any, *, is_named_so: bool) -> tuple[tuple[int, ...], str]:
     size = image.size
     try:
         image.seek(1)
-    except Exception:  # each of Pillow's decoders raises exceptions of different classes
+    except Exception:  # the class of the exception depends on Pillow's decoder
         return (0,), "its second picture is missing: both eyes see the first one"
     extra = b"".join(content for _, content in image.applist)
     if image.size != size or image.layers != 3 or any(mark in extra for mark in GAIN_MAP):
@@ -188,8 +188,8 @@ def _leia_view(coded: bytes | IO[bytes], size: tuple[int, int]) -> tuple[slice, 
     """Return the result of `other_view`, or None if the second view is not a picture of the given size.
 
     Args:
-        coded: Encoded picture or an open file.
-        size: Width and height of the first view.
+        coded: Encoded picture, as bytes or as an open file.
+        size: The first view's width and height.
     """
     file = io.BytesIO(coded) if isinstance(coded, bytes) else coded
     if found := other_view(file):
@@ -201,9 +201,9 @@ def _leia_view(coded: bytes | IO[bytes], size: tuple[int, int]) -> tuple[slice, 
 
 
 def _jps_layout(image: Any) -> str:
-    """Return the layout that a JPEG's stereo header (JPS) declares, or an empty string.
+    """Return the layout declared by a JPEG's stereo header (JPS), or an empty string.
 
-    The result is a value of the setting `content.layout`.
+    The result is in the syntax of the setting `content.layout`.
     """
     for name, data in getattr(image, "applist", ()):
         if name == "APP3" and data[:8] == JPS and len(data) >= JPS_BYTES:
@@ -242,7 +242,7 @@ def _viewpoint(image: Any) -> int | None:
 
 
 def picture_size(coded: bytes) -> tuple[int, int]:
-    """Return the stored width and height of an encoded picture, without applying the EXIF orientation.
+    """Return an encoded picture's stored width and height, without applying the EXIF orientation.
 
     Raises ValueError if the header cannot be decoded.
     """
@@ -250,18 +250,18 @@ def picture_size(coded: bytes) -> tuple[int, int]:
         with opened(coded) as image:
             width, height = image.size
             return width, height
-    except Exception as error:  # each of Pillow's formats raises exceptions of different classes
+    except Exception as error:  # the class of the exception depends on Pillow's format
         raise ValueError(undecodable(coded, error)) from None
 
 
 def undecodable(data: bytes, error: Exception | None = None) -> str:
-    """Return the reason why a picture cannot be decoded, as the end of a message.
+    """Return the reason why a picture cannot be decoded, worded as the end of a message.
 
-    The reason is an unsupported format, with a remedy, or a damaged file.
+    The reason is either an unsupported format, given with a remedy, or a damaged file.
 
     Args:
         data: Encoded picture.
-        error: Exception that Pillow raised, or None if the picture was not opened.
+        error: Exception raised by Pillow, or None if the picture was not opened.
     """
     from PIL import UnidentifiedImageError
 
@@ -297,10 +297,10 @@ def _promises_more(data: bytes) -> bool:
 
 
 def is_cut_off(coded: bytes) -> bool:
-    """Return True if a PNG is incomplete: a chunk exceeds the file or the last chunk is missing.
+    """Return True if a PNG is incomplete: a chunk extends beyond the file, or the last chunk is missing.
 
-    The result is False for other formats. OpenCV would allocate the size that the header of an incomplete picture
-    declares, up to 2 GiB for a file of any size.
+    Returns False for other formats. For an incomplete picture, OpenCV would allocate the size declared in the header,
+    which can be up to 2 GiB however small the file is.
     """
     if not coded.startswith(PNG):
         return False
@@ -314,7 +314,7 @@ def is_cut_off(coded: bytes) -> bool:
 
 
 def _orientation(image: Any) -> int:
-    """Return the EXIF orientation that is stored before the pixels, or 1.
+    """Return the EXIF orientation stored before the pixels, or 1.
 
     Pillow rotates TIFF pictures itself. Pillow's `getexif` is not suitable, because it would decompress a whole PNG.
     """
@@ -333,17 +333,17 @@ def _orientation(image: Any) -> int:
 def check_size(
     width_px: int, height_px: int, *, source: str | Path, field: str = "", name: str = "", head: bytes = b""
 ) -> None:
-    """Check the size of a picture against the limits.
+    """Check a picture's size against the limits.
 
-    A PNG with 16 bits per channel may have half as many pixels as other pictures.
+    The pixel limit for a PNG with 16 bits per channel is half that for other pictures.
 
     Args:
-        width_px: Width of the picture.
-        height_px: Height of the picture.
+        width_px: Picture width.
+        height_px: Picture height.
         source: File to name in messages.
-        field: Field of the file to name in messages.
+        field: Field in the file to name in messages.
         name: Name of the picture within the file.
-        head: Beginning of the encoded picture, from which 16 bits per channel are recognized.
+        head: First bytes of the encoded picture, used to detect 16 bits per channel.
 
     Raises:
         InputError: The picture has more pixels than allowed, or one side is longer than SIDE_MAX_PX.
@@ -356,12 +356,12 @@ def check_size(
 
 
 def decoded_picture(coded: bytes, *, source: str | Path, field: str, name: str) -> Any:
-    """Decode a picture that is part of a file, and return the Pillow image.
+    """Decode a picture contained in a file, and return the Pillow image.
 
     Args:
         coded: Encoded picture.
         source: File to name in messages.
-        field: Field of the file to name in messages.
+        field: Field in the file to name in messages.
         name: Name of the picture within the file.
 
     Raises:
@@ -375,12 +375,12 @@ def decoded_picture(coded: bytes, *, source: str | Path, field: str, name: str) 
             return image
     except InputError:
         raise
-    except Exception as error:  # each of Pillow's decoders raises exceptions of different classes
+    except Exception as error:  # the class of the exception depends on Pillow's decoder
         raise InputError(source, field, f"{name} {undecodable(coded, error)}") from None
 
 
 def camera_set_in(folder: Path) -> str:
-    """Return a message if a folder contains a camera set, which cannot be drawn, else an empty string.
+    """Return a message if a folder contains a camera set, which cannot be drawn, or else an empty string.
 
     A camera set is a collection of photos with camera poses, as used to train a NeRF.
     """
@@ -389,7 +389,7 @@ def camera_set_in(folder: Path) -> str:
 
 
 def read_coded(path: Path) -> tuple[bytes, Header]:
-    """Read the bytes of a picture file, and read and check the header.
+    """Read a picture file's bytes, and read and check its header.
 
     Raises:
         InputError: The file cannot be read, is not a supported picture or exceeds a limit, or the path is a folder with
@@ -402,7 +402,7 @@ def read_coded(path: Path) -> tuple[bytes, Header]:
 
 
 def header_of_file(path: Path) -> Header:
-    """Read and check the header of a picture file.
+    """Read and check a picture file's header.
 
     Raises InputError if the file cannot be read, is not a supported picture, or exceeds a limit.
     """

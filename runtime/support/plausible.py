@@ -1,4 +1,4 @@
-"""Checks for settings: ranges of numbers with hints about units, valid paths, and misspelt names."""
+"""Checks for settings: number ranges (with hints about units), valid paths, and misspelt names."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from pydantic import AfterValidator
 from runtime.support.ranges import refusal
 
 TEXT_MAX_BYTES = 4095  # maximum length of a path on Linux
-PART_MAX_BYTES = 255  # maximum length of one part of a path
+PART_MAX_BYTES = 255  # maximum length of each part of a path
 
 
 def within(low: float, high: float, unit: str, *, zero: bool = False) -> AfterValidator:
-    """Return a validator for numbers in a range, whose message suggests the unit used by mistake.
+    """Return a validator for numbers in a range. Its message suggests which unit was used by mistake.
 
     Args:
         low: Smallest valid number, finite.
@@ -52,7 +52,7 @@ def check_text(value: str) -> str:
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
-    """Return a hint such as `: did you mean model?` if a known word is similar, else an empty string.
+    """Return a hint such as `: did you mean model?` if a known word is similar, or else an empty string.
 
     >>> nearest("modle", ["model", "loop"])
     ': did you mean model?'

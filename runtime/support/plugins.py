@@ -1,4 +1,4 @@
-"""Plugins: Python classes of users, named `module:Class`, such as `mypackage.tunnel:Tunnel`."""
+"""Plugins: users' Python classes, named `module:Class`, such as `mypackage.tunnel:Tunnel`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def is_plugin(name: str) -> bool:
 def located(name: str, folder: Path) -> str:
     """Resolve a setting that may be a relative path against a folder.
 
-    Names (words without slash and suffix), URLs (`rtsp://...`) and classes (`module:Class`) are returned unchanged.
+    Names (words without a slash or suffix), URLs (`rtsp://...`) and classes (`module:Class`) are returned unchanged.
     """
     if "://" in name or is_plugin(name):
         return name
@@ -33,16 +33,16 @@ def located(name: str, folder: Path) -> str:
 
 
 def plugin_class(name: str, base: type, *, field: str) -> Any:
-    """Import the class of a plugin.
+    """Import a plugin's class.
 
     Args:
-        name: Name of the class, in the form `module:Class`.
-        base: Class from which the plugin has to be derived.
+        name: Class name in the form `module:Class`.
+        base: Class that the plugin must be derived from.
         field: Setting to name in messages.
 
     Raises:
         InputError: The module cannot be imported, or does not contain a class of that name derived from `base`.
-        MissingPart: The module needs an optional package that an extra of phasestack installs.
+        MissingPart: The module needs an optional package that is installed by one of phasestack's extras.
     """
     module, _, attribute = name.partition(":")
     try:
@@ -61,7 +61,7 @@ def plugin_class(name: str, base: type, *, field: str) -> Any:
 def strict(options: type[BaseModel]) -> type[BaseModel]:
     """Return a variant of a plugin's options that rejects unknown keys.
 
-    A class whose model configuration sets `extra` is returned unchanged.
+    If a class's model configuration sets `extra`, the class is returned unchanged.
     """
     if "extra" in options.model_config:
         return options

@@ -1,7 +1,7 @@
-"""Report the progress of long work to an optional listener, which may stop the work.
+"""Report progress on long tasks to an optional listener, which may stop the task.
 
-Functions call `tell` as they proceed, and `listening` installs a listener. An exception in the listener ends the work,
-which limits the reaction time to a signal to one step of the work.
+Functions call `tell` as they proceed, and `listening` installs a listener. An exception raised by the listener ends the
+task, so a signal takes effect after at most one step of the task.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from contextvars import ContextVar
 from typing import Any, TextIO, TypeVar
 
 T = TypeVar("T")
-NOW_AND_THEN_S = 10.0  # interval between two lines if the stream is not a terminal
+NOW_AND_THEN_S = 10.0  # interval between lines if the stream is not a terminal
 
-# Function that receives the name of the task (empty: the task has ended), the number of finished steps, and the total
+# Function that receives the task's name (empty: the task has ended), the number of finished steps, and the total
 # number of steps (None: unknown).
 Listener = Callable[[str, int, int | None], None]
 
@@ -23,10 +23,10 @@ _LISTENER: ContextVar[Listener | None] = ContextVar("progress", default=None)
 
 
 def tell(what: str, done: int, total: int | None = None) -> None:
-    """Report progress to the listener, if there is one. Exceptions of the listener propagate.
+    """Report progress to the listener, if there is one. Exceptions raised by the listener propagate.
 
     Args:
-        what: Name of the task. An empty name reports the end of the task.
+        what: Task name. An empty name reports that the task has ended.
         done: Number of finished steps.
         total: Total number of steps, or None if unknown.
     """
@@ -37,14 +37,14 @@ def tell(what: str, done: int, total: int | None = None) -> None:
 
 @contextmanager
 def task(what: str, *, seconds: float, too_slow: Exception) -> Iterator[None]:
-    """Report the beginning and the end of the task within the block, and limit the time of the task.
+    """Report when the task within the block begins and ends, and limit the task's time.
 
     An outer listener still receives all reports.
 
     Args:
-        what: Name of the task.
+        what: Task name.
         seconds: Time limit.
-        too_slow: Exception that `tell` raises within the block after the time limit.
+        too_slow: Exception that `tell` raises within the block once the time limit has passed.
     """
     end, outer = time.monotonic() + seconds, _LISTENER.get()
 
@@ -64,7 +64,7 @@ def task(what: str, *, seconds: float, too_slow: Exception) -> Iterator[None]:
 
 @contextmanager
 def listening(listener: Listener) -> Iterator[None]:
-    """Send the progress reports of this thread to a listener within the block."""
+    """Send this thread's progress reports to a listener within the block."""
     token = _LISTENER.set(listener)
     try:
         yield
@@ -74,10 +74,10 @@ def listening(listener: Listener) -> Iterator[None]:
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[Callable[[int, int], None]]:
-    """Yield a function that reports the finished and the total number of steps of a task.
+    """Yield a function that reports a task's finished steps and total steps.
 
     Args:
-        title: Name of the task, shown next to the progress bar.
+        title: Task name, shown next to the progress bar.
     """
     try:
         yield lambda done, total: tell(title, done, total)
@@ -87,10 +87,10 @@ def progress_bar(title: str) -> Iterator[Callable[[int, int], None]]:
 
 @contextmanager
 def status_line(title: str) -> Iterator[Callable[[str], None]]:
-    """Yield a function that reports a text as the current step of a task.
+    """Yield a function that reports a text as a task's current step.
 
     Args:
-        title: Name of the task, shown before the text.
+        title: Task name, shown before the text.
     """
     try:
         yield lambda text: tell(f"{title}: {text}", 0)
@@ -99,7 +99,7 @@ def status_line(title: str) -> Iterator[Callable[[str], None]]:
 
 
 def tracked(title: str, items: Sequence[T]) -> Iterator[T]:
-    """Yield the items of a sequence, and report progress after each item."""
+    """Yield a sequence's items, and report progress after each one."""
     with progress_bar(title) as update:
         for number, item in enumerate(items, start=1):
             yield item

@@ -1,15 +1,15 @@
-"""Ranges of numbers in settings, options and files. The module imports no heavy packages."""
+"""Ranges for numbers in settings, options and files. This module imports no heavy packages."""
 
 from __future__ import annotations
 
 import math
 
-EYE_MOST_M = 50.0  # largest absolute coordinate of an eye
-SEPARATION_MIN_M = 0.005  # minimum distance between two eyes; the tracker requires a plausible distance for a person
+EYE_MOST_M = 50.0  # largest absolute value of an eye's coordinates
+SEPARATION_MIN_M = 0.005  # minimum distance between two eyes; the tracker requires one that is plausible for a person
 FOV_RANGE_DEG = (0.1, 179.0)  # range of a picture's horizontal field of view
 RECORD_MOST_S = 604_800.0  # maximum length of a recording, one week
-SCALE = (1e-6, 1e6)  # range of scales between the units of two frames, which allows metres and micrometres
-# Units that are often used by mistake, by the proper unit. Each has the factor to the proper unit and a name.
+SCALE = (1e-6, 1e6)  # range of scales between two frames' units, wide enough for metres and micrometres
+# Units often used by mistake, keyed by the proper unit. Each is given as its factor to the proper unit and its name.
 OTHER_UNITS = {
     "m": ((1e-3, "millimetres"), (1e-2, "centimetres")),
     "s": ((1e-3, "milliseconds"),),
@@ -18,13 +18,14 @@ OTHER_UNITS = {
 
 
 def refusal(value: float, low: float, high: float, unit: str = "") -> str:
-    """Return an error message for a number out of range, or an empty string for a number in range.
+    """Return an error message for a number out of range, or an empty string if the number is in range.
 
     Args:
         value: Number to check.
         low: Smallest valid number, finite.
         high: Largest valid number, finite.
-        unit: Unit of the number. For m, s and ms, the message suggests a smaller unit if it makes the number valid.
+        unit: Unit of the number. For m, s and ms, the message suggests a smaller unit if the number would be valid in
+            that unit.
 
     Examples:
         >>> refusal(518.4, 0.005, 20.0, "m")

@@ -14,7 +14,7 @@ from runtime.support import untrusted_input
 from runtime.support.plausible import check_text, nearest
 
 TABLE_BYTES_MAX = 4 << 20
-KEY_PARTS_MAX = 16  # maximum number of parts of a dotted key; tomllib's time and memory grow with the square
+KEY_PARTS_MAX = 16  # maximum number of parts in a dotted key; tomllib's time and memory grow with its square
 STRINGS_AND_COMMENTS = re.compile(
     r'''"""(?:[^\\]|\\.)*?"""|\'{3}.*?\'{3}|"(?:[^"\\\n]|\\.)*"|'[^'\n]*'|#[^\n]*''', re.DOTALL
 )
@@ -23,7 +23,7 @@ M = TypeVar("M", bound=BaseModel)
 
 
 class Section(BaseModel):
-    """Base of the records that tables are validated against.
+    """Base class for the records that tables are validated against.
 
     Records are frozen. Unknown keys, non-finite numbers and strings that are not valid names or paths are rejected.
     """
@@ -65,10 +65,10 @@ def validated(model: type[M], table: dict[str, Any], *, source: str | Path, fold
     """Validate a table and return the record.
 
     Args:
-        model: Class of the record.
+        model: Record class.
         table: Table to validate.
         source: File to name in messages.
-        folder: Folder against which relative paths are resolved (`runtime.config.paths`). None: leave paths unchanged.
+        folder: Folder that relative paths are resolved against (`runtime.config.paths`). None: leave paths unchanged.
 
     Raises:
         InputError: A field is invalid, missing or unknown. The message names every such field.
@@ -82,19 +82,19 @@ def validated(model: type[M], table: dict[str, Any], *, source: str | Path, fold
 
 
 def _wrong_field(model: type[BaseModel], error: Any) -> tuple[str, str]:
-    """Return the full name of the field that an error from pydantic concerns, and the problem."""
+    """Return the full name of the field that a pydantic error concerns, and the problem."""
     name = ".".join(str(part) for part in error["loc"])
     message = error["msg"].removeprefix("Value error, ")
     if error["type"] == "extra_forbidden":
         return name, "is not a setting" + nearest(str(error["loc"][-1]), _keys(model, error["loc"][:-1]))
     field, colon, rest = message.partition(": ")
     if colon and error["type"] == "value_error" and field.partition(".")[0] in _keys(model, error["loc"]):
-        return ".".join(filter(None, (name, field))), rest  # error of a rule about several fields
+        return ".".join(filter(None, (name, field))), rest  # error raised by a rule about several fields
     return name, message
 
 
 def _keys(model: type[BaseModel], path: tuple[int | str, ...]) -> list[str]:
-    """Return the allowed keys of the table at a path of keys within a record."""
+    """Return the keys allowed in the table at a path of keys within a record."""
     table: Any = model
     for part in path:
         if isinstance(part, str) and part in getattr(table, "model_fields", ()):

@@ -10,41 +10,41 @@ from typing import TypeVar
 
 import cv2
 
-PIECE_ROWS = 128  # number of picture rows per item if `parallel_map` is used on parts of a picture
+PIECE_ROWS = 128  # number of picture rows per item when `parallel_map` is used on parts of a picture
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
 def parallel_map(work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-    """Call `work` on every item in parallel, and return the results in the order of the items.
+    """Call `work` on every item in parallel, and return the results in the same order as the items.
 
-    The number of threads is OpenCV's setting (`cv2.getNumThreads`). Exceptions of `work` propagate.
+    Uses as many threads as OpenCV is configured to use (`cv2.getNumThreads`). Exceptions raised by `work` propagate.
     """
     threads = cv2.getNumThreads()
     if threads < 2 or len(items) < 2:
         return [work(item) for item in items]
     others = [_pool(threads).submit(work, item) for item in items[1:]]
     try:
-        first = work(items[0])  # runs on this thread, which saves waking another thread
+        first = work(items[0])  # runs on this thread, to avoid waking another one
     finally:
         wait(others)
     return [first, *(other.result() for other in others)]
 
 
 def on_rows(work: Callable[[int, int], None], rows: int, *, threads: int | None = None) -> None:
-    """Split rows into parts of about equal size, and call `work(begin, end)` for the parts in parallel.
+    """Split rows into parts of about equal size, and call `work(begin, end)` for each part in parallel.
 
     Args:
         work: Function that processes the rows from `begin` up to but excluding `end`.
         rows: Total number of rows.
-        threads: Number of parts, by default OpenCV's number of threads.
+        threads: Number of parts. By default, OpenCV's number of threads.
     """
     parts = threads or max(1, cv2.getNumThreads())
     parallel_map(lambda span: work(*span), list(pairwise(rows * part // parts for part in range(parts + 1))))
 
 
 def fresh_threads() -> None:
-    """Make the next call of `parallel_map` start new threads, which inherit the niceness of the caller."""
+    """Make the next `parallel_map` call start new threads, which inherit the caller's niceness."""
     _pool.cache_clear()
 
 

@@ -1,7 +1,7 @@
 """Read untrusted input (paths, files, JSON, numbers) within limits.
 
-All untrusted bytes are read with this module. For invalid input, the functions raise InputError with a one-line message
-that names the file, the field and, if applicable, the limit that was exceeded.
+All untrusted bytes are read through this module. For invalid input, the functions raise InputError with a one-line
+message that names the file, the field and, if applicable, the limit that was exceeded.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from runtime.errors import InputError
 
 JSON_DEPTH_MAX = 64  # maximum depth of nested objects, well within Python's recursion limit
 JSON_BYTES_MAX = 64 << 20  # maximum size of a JSON file
-DIGITS_MAX = 19  # maximum number of decimal digits, as in a 63-bit number
+DIGITS_MAX = 19  # maximum number of decimal digits: enough for a 63-bit number
 MIB = 1 << 20
 
 
@@ -26,25 +26,25 @@ MIB = 1 << 20
 class Limits:
     """Limits for untrusted files, which are checked before memory is allocated."""
 
-    file_bytes: int = 1 << 30  # size of a file of content or of a recording
-    pixels: int = 134_217_728  # number of pixels of one picture: 16384 x 8192
-    texture_pixels: int = 134_217_728  # total number of pixels of all pictures in a scene
+    file_bytes: int = 1 << 30  # size of a content file or of a recording
+    pixels: int = 134_217_728  # number of pixels in one picture: 16384 x 8192
+    texture_pixels: int = 134_217_728  # total number of pixels in all of a scene's pictures
     triangles: int = 2_000_000  # number of triangles in a scene, summed over all instances
     splats: int = 3_000_000
     instances: int = 2000  # number of placed meshes in a glTF scene
-    json_values: int = 4_000_000  # number of values in one JSON text, which take a gigabyte in Python
-    depth: int = 64  # nesting depth of JSON or of a glTF scene
+    json_values: int = 4_000_000  # number of values in one JSON text; this many take a gigabyte in Python
+    depth: int = 64  # nesting depth in JSON or in a glTF scene
     load_s: float = 120.0  # time for loading one piece of content
-    start_s: float = 600.0  # time for a start, which loads content and model
-    recording_s: float = 21_600.0  # length of a recording that is replayed
-    chunk_bytes: int = 32 << 20  # unpacked size of one chunk or message of a recording
+    start_s: float = 600.0  # time for startup, which loads the content and the model
+    recording_s: float = 21_600.0  # length of a replayed recording
+    chunk_bytes: int = 32 << 20  # unpacked size of one chunk or message in a recording
 
 
 LIMITS = Limits()  # not configurable; tests lower them
 
 
 def checked_path(path: str | Path, *, source: str | Path = "", field: str = "") -> Path:
-    """Check that a path is valid on this system, and return the path, which need not exist.
+    """Check that a path is valid on this system, and return it. The path need not exist.
 
     Args:
         path: Path to check.
@@ -86,12 +86,12 @@ def open_regular(
 ) -> IO[bytes]:
     """Open a regular file for reading.
 
-    The function never blocks, unlike `open` on a FIFO without a writer. The checks apply to the open file, which cannot
-    be exchanged in the meantime.
+    Never blocks, unlike `open` on a FIFO without a writer. The checks are made on the open file, so that it cannot be
+    exchanged in the meantime.
 
     Args:
         path: File to open.
-        most_bytes: Maximum size of the file. None: any size.
+        most_bytes: Maximum file size. None: any size.
         source: File to name in messages, by default the path.
         field: Setting or field to name in messages.
 
@@ -117,7 +117,7 @@ def open_regular(
 
 
 def read_bytes(path: str | Path, *, most_bytes: int, source: str | Path = "", field: str = "") -> bytes:
-    """Read a regular file. The arguments are those of `open_regular`.
+    """Read a regular file. The arguments are the same as for `open_regular`.
 
     Raises InputError if the file cannot be read, is not a regular file or is larger than `most_bytes`.
     """
@@ -136,7 +136,7 @@ def read_bytes(path: str | Path, *, most_bytes: int, source: str | Path = "", fi
 
 
 def read_text(path: str | Path, *, most_bytes: int = JSON_BYTES_MAX, source: str | Path = "", field: str = "") -> str:
-    """Read a UTF-8 text file. The arguments are those of `open_regular`.
+    """Read a UTF-8 text file. The arguments are the same as for `open_regular`.
 
     Raises InputError if the file cannot be read, is larger than `most_bytes` or is not UTF-8.
     """
@@ -164,7 +164,7 @@ def parsed_json(text: str | bytes, *, source: str | Path, most_depth: int = JSON
     """Parse strict JSON, which excludes NaN and Infinity.
 
     Args:
-        text: JSON text, as a string or in UTF-8.
+        text: JSON text, as a string or as UTF-8 bytes.
         source: File to name in messages.
         most_depth: Maximum depth of nested lists and objects.
 
@@ -204,7 +204,7 @@ def _whole(digits: str) -> int | float:
 
 def whole_from_text(text: str, *, source: str | Path, field: str) -> int:
     """Parse a non-negative integer. Raises InputError for other text and for more than DIGITS_MAX digits."""
-    # `isdigit` alone accepts a superscript two, and `int` accepts digits of other scripts.
+    # `isdigit` alone accepts a superscript two, and `int` accepts digits from other scripts.
     if not (text.isascii() and text.isdigit()):
         raise InputError(source, field, f"is not a whole number: {shown(text)}")
     if len(text) > DIGITS_MAX:
@@ -219,7 +219,7 @@ def within(count: int | float, most: int | float, *, source: str | Path, field: 
         count: Count to check.
         most: Limit.
         source: File to name in messages.
-        field: Name of the counted things for messages, such as `JSON values`.
+        field: What is counted, for messages, such as `JSON values`.
 
     Raises:
         InputError: The count exceeds the limit.
