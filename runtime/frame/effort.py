@@ -169,7 +169,7 @@ class PictureStatistics:
     """Estimates solution errors and how fast the pictures change, based on measurements."""
 
     residual: float = FIRST_RESIDUAL  # squared error on the solution's raster without any steps
-    detail: dict[int, float] = field(default_factory=lambda: dict(FIRST_DETAIL))  # error due to lost detail
+    detail: dict[int, float] = field(default_factory=lambda: dict(FIRST_DETAIL))  # error from lost detail, by reduction
     rate_m: float = FIRST_RATE  # a, per metre
     rate_s2: float = 0.0  # b, per square second
     contrast: float = FIRST_CONTRAST  # D_max
