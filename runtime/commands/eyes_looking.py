@@ -36,7 +36,7 @@ class Watcher:
     """Finds eyes, and reports the result for each frame as a row of values."""
 
     def __init__(self, settings: Settings) -> None:
-        cv2.setNumThreads(1)  # as in the display loop
+        cv2.setNumThreads(1)  # like the display loop
         self._finder = EyeFinder(settings)
         self.forget = self._finder.forget
 

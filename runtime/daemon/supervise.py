@@ -126,7 +126,7 @@ class Daemon(Host):
     def starting(self, doing: str) -> bool:
         """Report the current startup step and ask systemd for more time.
 
-        Returns False after a stop signal.
+        After a stop signal, returns False.
         """
         self._notifier.starting()
         self._notifier.status(f"starting ({doing})")

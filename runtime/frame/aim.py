@@ -40,7 +40,7 @@ class Aim:
         self._chooser = EffortChooser()
         self._calm_ns: int | None = None  # when the head's speed fell below CALM_M_S
         self._expected: dict[int, float] = {}  # expected squared distance to the true eyes, m², by requested time
-        self._speed2 = 0.0  # running mean of the squared speed in (m/s)²
+        self._speed2 = 0.0  # running mean of the squared speed, in (m/s)²
         self._learned: int | None = None  # number of the latest solution whose measures have been used
 
     def request(

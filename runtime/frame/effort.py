@@ -133,7 +133,7 @@ class Outlook:
     """Expected accuracy of the eyes predicted for a solution, which depends on the solution's effort."""
 
     sigma_m: float = 0.0  # standard deviation of the predicted midpoint of the eyes along each axis
-    speed_m_s: float = 0.0  # speed of the head
+    speed_m_s: float = 0.0  # the head's speed
     lag_m: float = 0.0  # how far the head moves beyond the tracker's prediction horizon
 
     def moved_m2(self, life_s: float) -> float:

@@ -17,9 +17,9 @@ from runtime.records import RefreshAccount, SensorFrame
 
 
 class RunObserver:
-    """Records and measures the refreshes of one run.
+    """Records and measures a run's refreshes.
 
-    The presenter passes every sample and refresh to the observer. `finish` completes the records after the run.
+    The presenter passes on every sample and refresh. After the run, `finish` completes the records.
     """
 
     def __init__(

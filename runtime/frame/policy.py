@@ -92,7 +92,7 @@ class FramePolicy:
     def _eyes_to_solve(
         self, request: SolveRequest, plan: Plan | None, *, state_version: int, revision: int, solved: SolutionKey | None
     ) -> F64 | None:
-        """Return the eyes (2, 3) to solve for.
+        """Choose the eyes (2, 3) to solve for.
 
         Returns None if the latest solution is still valid or if no eyes are known.
         """

@@ -109,7 +109,7 @@ class RefreshTimes:
             self.stage_ms[stage] = self._watch.stage_ms[stage]
         elif stage not in self.stage_ms:
             cost_ms = self._simulated_ms.get(stage, 0.0)
-            if stage != "wait":  # waiting advances the simulated clock anyway
+            if stage != "wait":  # while waiting, the simulated clock has advanced anyway
                 self._simulated.advance_ns(round(cost_ms * NS_PER_MS))
             self.stage_ms[stage] = cost_ms
 

@@ -58,7 +58,7 @@ class Monitor:
 
 
 def in_order(monitors: Sequence[Monitor]) -> tuple[Monitor, ...]:
-    """Sort monitors from left to right, then from top to bottom."""
+    """Return the monitors sorted from left to right, then from top to bottom."""
     return tuple(sorted(monitors, key=lambda monitor: (monitor.x_px, monitor.y_px, monitor.connector)))
 
 
