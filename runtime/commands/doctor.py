@@ -29,7 +29,7 @@ CHECK_SENSOR_FOR_S = 3.0  # how long to wait for a sensor's first sample
 SERVICE_CONFIG = Path("/etc/phasestack/phasestack.toml")
 SLOW_MS = 150.0  # if a solution takes longer, moving viewers see a worse picture (docs/performance.md)
 MEASURED_MS = 2000.0  # if a solution is expected to take longer, it is not timed at full size
-NO_DEVICE = ("replay", "fixed")  # drivers for which no device is needed
+NO_DEVICE = ("replay", "fixed")  # drivers that do not need a device
 
 
 @dataclass(frozen=True, slots=True)

@@ -179,7 +179,7 @@ class Aim:
 
         Args:
             shown: The solution to refine.
-            most: Largest total number of steps to which the solution can be continued.
+            most: Largest total number of steps that the solution can be continued to.
             costs: Solution costs.
             shown_error: Squared error expected from the solution now shown.
             horizon_s: How long the head is expected to stay at rest, in seconds.

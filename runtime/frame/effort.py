@@ -26,7 +26,7 @@ from runtime.records import Effort, Measures
 
 SOLVING_STAGES = ("render", "prepare", "inference", "finish", "step")
 HORIZON_S = 1.0  # how long head and content are assumed to continue as they are
-EQUAL = 1.03  # the fastest of all efforts whose mean error is within this factor of the lowest is chosen
+EQUAL = 1.03  # the fastest effort with a mean error at most this many times the lowest is chosen
 PREFERRED = 0.93  # another effort is chosen if its mean error is below this share of the current effort's
 GAIN = 0.2  # weight given to the latest measurement in a running mean
 KEPT_SOLUTIONS = 100  # a raster's times are discarded after this many solutions on other rasters
@@ -273,7 +273,7 @@ class EffortChooser:
         return waited * shown_error + (1 - waited) * error + waited**2 / 2 * self.pictures.contrast
 
     def expected_error(self, effort: Effort, outlook: Outlook, *, life_s: float) -> float:
-        """Return J, the mean squared light error over the `life_s` seconds for which a solution is shown."""
+        """Return J, the mean squared light error while a solution is shown for `life_s` seconds."""
         spread_s = life_s / 12**0.5
         moved_m = (self.foresight.scale * outlook.moved_m2(life_s)) ** 0.5
         return self.pictures.own(effort) + self.pictures.stale(moved_m, spread_s)

@@ -148,7 +148,7 @@ class Presenter:
 
         Args:
             run: Cell that holds the run's state.
-            stack: Panels of the display.
+            stack: The display's panels.
             clock: The run's clock.
             pacer: Schedules the refreshes.
             samples: Source of samples.

@@ -30,7 +30,7 @@ class RefreshLines:
     def __init__(self, truth: TrueEyes, write: Callable[[dict[str, Any]], None] | None) -> None:
         self._truth, self._write = truth, write
         self._waiting: deque[RefreshAccount] = deque()
-        self.view_error_mm = Quantiles()  # of each refresh that shows a solution and whose true eyes are known
+        self.view_error_mm = Quantiles()  # for each refresh that shows a solution, if the true eyes are known
 
     def add(self, account: RefreshAccount) -> None:
         """Queue a refresh."""

@@ -106,7 +106,7 @@ class QualitySampler:
                 time.sleep(LOOK_S)
 
     def advance(self, *, at_once: bool = False) -> None:
-        """Collect a finished measurement, and start measuring any refresh whose true eyes are now known.
+        """Collect a finished measurement, and measure queued refreshes if their true eyes are now known.
 
         Args:
             at_once: Start the next measurement now, even if measuring then takes more than `MEASURING_SHARE` of the

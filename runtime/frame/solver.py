@@ -50,7 +50,7 @@ class Solver:
 
         Args:
             run: Cell that holds the run's state.
-            stack: Panels of the display.
+            stack: The display's panels.
             timed: True to apply `model.budget_ms`. False on a simulated clock, because results must then not depend on
                 the machine's speed.
         """

@@ -31,7 +31,7 @@ class TargetDrawer:
 
         Args:
             solver: Host of the solver whose thread draws the pictures.
-            stack: Panels of the display.
+            stack: The display's panels.
             fov_deg: Function that returns the target pictures' current field of view, which a reload may change.
             shown_content: Function that returns the run's current content, or None if the content is never replaced.
         """

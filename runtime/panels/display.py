@@ -29,7 +29,7 @@ glfw.ERROR_REPORTING = "exception"
 
 @cache
 def gl_function(name: str) -> int:
-    """Return the address of an OpenGL function, or 0 if the function is missing.
+    """Return an OpenGL function's address, or 0 if there is no such function.
 
     The address is the same in all contexts. It is cached because moderngl keeps references to all functions, which
     would otherwise take 20 KiB per context.

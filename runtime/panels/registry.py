@@ -56,7 +56,7 @@ def open_panels(settings: OutputSettings, stack: PanelStack, clock: Clock, conte
 
     Args:
         settings: The `[output]` section of the settings.
-        stack: Panels of the display.
+        stack: The display's panels.
         clock: The run's clock.
         context: The content's GL context. The output makes it current again at the end of each call.
 

@@ -56,7 +56,7 @@ class WindowPanels(PanelSink):
 
         Args:
             panels: Panel settings, rear to front.
-            stack: Panels of the display.
+            stack: The display's panels.
             clock: The run's clock.
             content: The content's GL context.
             any_shape: True to accept monitors whose resolution differs from the stack's and to fill them, for
