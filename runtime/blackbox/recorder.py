@@ -1,10 +1,11 @@
-"""Black box that writes the last minutes of a run to an MCAP file, on request or after a fault.
+"""Black box that writes a run's last few minutes to an MCAP file, on request or after a fault.
 
-Every few seconds, new messages are appended to a journal on disk, which is deleted when the run ends normally. After a
-power cut or a kill, the next run finds the journal and renames it to a file of the kind `cut`.
+Every few seconds, new messages are appended to a journal on disk. When a run ends normally, its journal is deleted. If
+the run is ended by a power cut or killed, the next run finds the journal and renames it as a file of kind `cut`.
 
-The files are also recordings, whose samples `run --replay` plays through the same code. Messages are serialised when
-they arrive, because the garbage collector then never visits them. A background job writes the files.
+The files can also be used as recordings: `run --replay` plays back their samples through the same code. Messages are
+serialised as they arrive, so that the garbage collector never has to visit them. The files are written by a background
+job.
 """
 
 from __future__ import annotations
@@ -42,26 +43,26 @@ from runtime.support.version import version
 
 log = logging.getLogger("phasestack.blackbox")
 
-Saved = Callable[[str, Path | None], None]  # callback with the error message (empty on success) and the file
+Saved = Callable[[str, Path | None], None]  # called with an error message (empty on success) and the file
 
-BYTES_MAX = 32 << 20  # limit for all messages in memory
-OVERHEAD_BYTES = 150  # memory that a message needs in addition to its data
-AFTER_FAULT_NS = 5 * NS_PER_S  # time recorded after a fault before its file is written
-FAULTS_APART_NS = 60 * NS_PER_S  # minimum time between files of one kind; keeps repeated faults from filling the disk
-STATE_EVERY_NS = NS_PER_S  # interval between state messages while the state does not change
-WRITTEN_WITHIN_S = 5.0  # time limit for writing the last file at the end of a run
-JOURNAL_EVERY_NS = 3 * NS_PER_S  # a power cut loses at most this much time, plus one chunk
-CHUNK_BYTES = 16384  # chunk size of the journal
-CUT = "cut"  # kind of a file recovered from a journal
-LINES_KEPT, STATES_KEPT = 200, 50  # log lines and states kept for the operator's page
-FILES_MAX = 20  # maximum number of files in the folder
+BYTES_MAX = 32 << 20  # limit for all messages kept in memory
+OVERHEAD_BYTES = 150  # memory needed for a message in addition to its data
+AFTER_FAULT_NS = 5 * NS_PER_S  # how long to keep recording after a fault before writing the file
+FAULTS_APART_NS = 60 * NS_PER_S  # minimum time between files of one kind, so that repeated faults do not fill the disk
+STATE_EVERY_NS = NS_PER_S  # interval between state messages while the state stays the same
+WRITTEN_WITHIN_S = 5.0  # how long to wait for the last file at the end of a run
+JOURNAL_EVERY_NS = 3 * NS_PER_S  # at most this much is lost in a power cut, plus one chunk
+CHUNK_BYTES = 16384  # the journal's chunk size
+CUT = "cut"  # kind of file recovered from a journal
+LINES_KEPT, STATES_KEPT = 200, 50  # how many log lines and states are kept for the operator's page
+FILES_MAX = 20  # maximum number of files kept in the folder
 PREFIX = "blackbox-"
-ASKED = "asked"  # kind of a file that an operator has requested
+ASKED = "asked"  # kind of file requested by an operator
 JOURNAL = "journal"
 PART = ".part"  # suffix of an unfinished file
 
 LOG, REFRESH, STATE = "/log", "/refresh", "/state"
-# Viewers can plot any number. Only the topics that they display in a special way need a schema with field names.
+# Viewers can plot any number. A schema with field names is needed only for topics that they display in a special way.
 SCHEMAS: dict[str, dict[str, Any]] = {
     **fmt.SCHEMAS,
     LOG: {
@@ -80,7 +81,7 @@ SCHEMAS: dict[str, dict[str, Any]] = {
 
 
 def refresh_message(account: RefreshAccount) -> bytes:
-    """Return a refresh as JSON: the line in `frames.jsonl`, with the display time and the latency."""
+    """Return a refresh as JSON: its line in `frames.jsonl`, plus the display time and latency."""
     latency_ms = None
     if account.eyes_m is not None and account.capture_ns:
         latency_ms = round((account.photon_ns - account.capture_ns) / NS_PER_MS, 4)
@@ -88,18 +89,18 @@ def refresh_message(account: RefreshAccount) -> bytes:
 
 
 def state_message(name: str, reason: str, *, monotonic_ns: int) -> bytes:
-    """Return a state as JSON, with the missing parts of a name such as `degraded: sensor, panel`."""
+    """Return a state as JSON, including the missing parts from a name such as `degraded: sensor, panel`."""
     plain, _, missing = name.partition(": ")
     parts = missing.split(", ") if missing else []
     return to_json({"monotonic_ns": monotonic_ns, "state": plain, "missing": parts, "reason": reason}).encode()
 
 
 def log_message(record: logging.LogRecord) -> bytes:
-    """Return a log record as JSON, in the format of Foxglove's log messages."""
+    """Return a log record as JSON, in the format used for Foxglove log messages."""
     seconds, nanoseconds = divmod(round(record.created * NS_PER_S), NS_PER_S)
     line = {
         "timestamp": {"sec": seconds, "nsec": nanoseconds},
-        "level": record.levelno // 10,  # Foxglove's levels are Python's divided by ten
+        "level": record.levelno // 10,  # a Foxglove level is the Python level divided by ten
         "message": text_of(record),
         "name": record.name,
     }
@@ -115,27 +116,28 @@ def text_of(record: logging.LogRecord) -> str:
 
 
 class BlackBoxMessage(NamedTuple):
-    """Message that the black box keeps, serialised as in the file."""
+    """A message kept by the black box, serialised as in its files."""
 
-    at_ns: int  # time on the run's clock, because the wall clock may be set back
+    at_ns: int  # time on the run's clock; the wall clock may be set back
     wall_ns: int  # wall-clock time since 1970
     topic: str
     data: bytes  # JSON
-    sequence: int  # number of the sample or refresh, modulo 2^32; 0 for other messages
+    sequence: int  # sample or refresh number, modulo 2^32; 0 for other messages
 
 
 class Recorder(logging.Handler):
-    """Recorder of a run's samples, refreshes, states and log, from `watches` to `close`.
+    """Records a run's samples, refreshes, states and log, from `watches` to `close`.
 
-    The presenter's thread calls the methods of an observer. Any thread may log. A background job writes each file.
+    The observer methods are called on the presenter's thread. Any thread may log. Each file is written by a background
+    job.
     """
 
     def __init__(self, folder: Path, *, minutes: float) -> None:
-        """Prepare the folder and recover the journal of a killed run.
+        """Prepare the folder, and recover the journal if the last run was killed.
 
         Args:
             folder: Folder for the black box's files.
-            minutes: Length of the history in memory. 0: neither keep nor write any messages.
+            minutes: How much history to keep in memory. 0 means that no messages are kept or written.
         """
         super().__init__()
         self._folder, self._most_ns = folder, round(60 * minutes * NS_PER_S)
@@ -145,15 +147,15 @@ class Recorder(logging.Handler):
         self._presenter: Presenter | None = None
         self._sensor_from_stack: F64 | None = None
         self._state, self._state_ns = ("", ""), 0
-        self._fault: tuple[int, str] | None = None  # start and kind of a fault whose file has not been written yet
-        self._faults_ns: dict[str, int] = {}  # time of the last fault of each kind
+        self._fault: tuple[int, str] | None = None  # start and kind of a fault not yet written to a file
+        self._faults_ns: dict[str, int] = {}  # time of the latest fault of each kind
         self._last_file: Path | None = None
         self._lines: deque[dict[str, Any]] = deque(maxlen=LINES_KEPT)
         self._passed: deque[dict[str, Any]] = deque(maxlen=STATES_KEPT)
         self._waiting_lock, self._is_writing = threading.Lock(), False
-        self._waiting: dict[str, list[Saved]] = {}  # requests for files that the writer has not started yet, by kind
+        self._waiting: dict[str, list[Saved]] = {}  # requests for files not yet started by the writer, by kind
         self._writer: BackgroundJob[None] | None = None
-        self._fresh = 0  # number of newest messages that are not yet in the journal
+        self._fresh = 0  # how many of the newest messages are not in the journal yet
         self._journal, self._journaled_ns = _Journal(folder), 0
         self._journaling: BackgroundJob[None] | None = None
         if self._most_ns:
@@ -167,8 +169,8 @@ class Recorder(logging.Handler):
         """Start recording.
 
         Args:
-            presenter: Presenter of the run.
-            in_stack_frame: True if samples arrive in the frame `stack`. They are recorded in the frame `sensor`.
+            presenter: The run's presenter.
+            in_stack_frame: True if samples arrive in the `stack` frame. They are always recorded in the `sensor` frame.
         """
         self._presenter = presenter
         if in_stack_frame:
@@ -199,7 +201,7 @@ class Recorder(logging.Handler):
             with self._kept_lock:
                 fresh = list(islice(reversed(self._kept), self._fresh))[::-1]
                 self._fresh = 0
-            # A background job writes the journal, because a refresh must not wait for the disk.
+            # The journal is written in the background, because a refresh must not wait for the disk.
             work = partial(self._journal.add, fresh, *_head(self._presenter), most_ns=self._most_ns)
             self._journaling = BackgroundJob("black box's journal", work)
         if self._fault is not None and at_ns - self._fault[0] >= AFTER_FAULT_NS:
@@ -208,7 +210,7 @@ class Recorder(logging.Handler):
 
     def _state_changed(self, name: str, reason: str, at_ns: int) -> None:
         self._passed.append({"time_s": round(time.time(), 3), "state": name, "reason": reason})
-        was_well = self._state[0].partition(":")[0] not in ("", "starting", "degraded")  # a slow start is not a fault
+        was_well = self._state[0].partition(":")[0] not in ("", "starting", "degraded")  # a slow startup is not a fault
         if not name.startswith("degraded") or not was_well or self._fault is not None or not self._most_ns:
             return
         kind = "fault-" + name.partition(": ")[2].replace(", ", "+")
@@ -216,7 +218,7 @@ class Recorder(logging.Handler):
             self._fault, self._faults_ns[kind] = (at_ns, kind), at_ns
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Keep a log record. Called on the thread that logs."""
+        """Keep a log record. Called on whichever thread logs it."""
         line = {"time_s": round(record.created, 3), "level": record.levelname.lower()}
         self._lines.append(line | {"text": text_of(record)})
         self._keep(LOG, log_message(record))
@@ -230,16 +232,16 @@ class Recorder(logging.Handler):
             self._bytes += len(data) + OVERHEAD_BYTES
             while self._kept and (self._bytes > BYTES_MAX or at_ns - self._kept[0].at_ns > self._most_ns):
                 self._bytes -= len(self._kept.popleft().data) + OVERHEAD_BYTES
-            self._fresh = min(self._fresh, len(self._kept))  # bounds the memory if the journal hangs
+            self._fresh = min(self._fresh, len(self._kept))  # limits the memory used if the journal hangs
 
     def save(self, kind: str, saved: Saved = lambda problem, path: None) -> None:
-        """Write the kept messages to a file in the background, then call `saved`.
+        """Write all kept messages to a file in the background, then call `saved`.
 
-        All requests of one kind that arrive before the file is begun share that file.
+        If several requests of the same kind arrive before their file has been started, they share one file.
 
         Args:
-            kind: `asked`, or the name of a fault. Becomes part of the file name.
-            saved: Callback with the error message (empty on success) and the file.
+            kind: `asked` or the name of a fault, used in the file name.
+            saved: Function called with an error message (empty on success) and the file.
         """
         if not self._most_ns or self._presenter is None:
             saved("the black box is switched off (service.blackbox_minutes is 0)", None)
@@ -256,7 +258,7 @@ class Recorder(logging.Handler):
         saved(self._writer.problem, None)
 
     def _write(self, presenter: Presenter) -> None:
-        """Write the requested files in the order of their first request, on the writer's thread."""
+        """On the writer's thread, write all requested files in the order they were first requested."""
         while True:
             with self._waiting_lock:
                 self._is_writing = bool(self._waiting)
@@ -278,11 +280,11 @@ class Recorder(logging.Handler):
                 saved(problem, None if problem else self._last_file)
 
     def look_at_log(self) -> dict[str, Any]:
-        """Return the newest log lines and states, oldest first, with times in seconds since 1970."""
+        """Return the latest log lines and states, oldest first, with times in seconds since 1970."""
         return {"lines": list(self._lines), "states": list(self._passed)}
 
     def describe(self) -> dict[str, Any]:
-        """Return the entry for the black box in the daemon's status."""
+        """Return the black box's entry in the daemon's status."""
         with self._kept_lock:
             kept_ns = self._kept[-1].at_ns - self._kept[0].at_ns if self._kept else 0
             kept_bytes = self._bytes
@@ -298,14 +300,14 @@ class Recorder(logging.Handler):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close the recorder. After an unexpected error, write the kept messages to a file."""
+        """Close the recorder. After an unexpected error, write all kept messages to a file first."""
         if isinstance(error, Exception) and not isinstance(error, Stopped | InputError) and self._presenter is not None:
             log.error("%s", one_line(f"{type(error).__name__}: {error}"))
             self._fault = (0, "error")
         self.close()
 
     def close(self) -> None:
-        """Stop recording and finish pending files. May be called twice."""
+        """Stop recording and finish any pending files. May be called more than once."""
         for name in ROOTS:
             logging.getLogger(name).removeHandler(self)
         if self._fault is not None:
@@ -314,24 +316,25 @@ class Recorder(logging.Handler):
         for job in (self._writer, self._journaling):
             if job is not None:
                 job.wait(WRITTEN_WITHIN_S)
-        if self._writer is None or self._writer.done:  # otherwise leave the journal for the next run
+        if self._writer is None or self._writer.done:  # if not, keep the journal for the next run
             self._journal.close(in_use=self._journaling is not None and not self._journaling.done)
         self._presenter = None
         super().close()
 
 
 def _head(presenter: Presenter) -> tuple[RecordingHeader, str]:
-    """Return the recording header and the settings as JSON, which precede the messages of a file."""
+    """Return the recording header, and the settings as JSON, to be written before a file's messages."""
     settings = presenter.run_cell.state.settings
     header = RecordingHeader(settings.sensor.driver, presenter.samples.serial)
     return header, without_secrets(settings.model_dump_json())
 
 
 def write_file(folder: Path, kind: str, kept: list[BlackBoxMessage], header: RecordingHeader, settings: str) -> Path:
-    """Write messages to a new file, atomically, and return the path.
+    """Write messages to a new file, atomically, and return its path.
 
-    Only the owner can read the file, because it shows viewers' movements. The number in the name is higher than
-    all others in the folder, because the wall clock may be set back. Raises OSError if the file cannot be written.
+    The file can be read only by its owner, because it shows how viewers moved. The number in its name is higher than
+    any other in the folder, because dates may be wrong if the wall clock has been set back. Raises OSError if the file
+    cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = _next_name(folder, kind, datetime.now(UTC))
@@ -357,12 +360,12 @@ def _next_name(folder: Path, kind: str, at: datetime) -> Path:
 
 def _opened(part: Path) -> IO[bytes]:
     file = os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600), "wb")
-    fcntl.flock(file, fcntl.LOCK_EX)  # unlocked partial files are deleted by `_sweep`
+    fcntl.flock(file, fcntl.LOCK_EX)  # `_sweep` deletes any partial file that is not locked
     return file
 
 
 class _Written:
-    """Writer of messages to an open MCAP file."""
+    """Writes messages to an open MCAP file."""
 
     def __init__(self, file: IO[bytes], header: RecordingHeader, settings: str) -> None:
         from mcap.writer import CompressionType, Writer
@@ -385,9 +388,9 @@ class _Written:
 
 
 class _Journal:
-    """Journal on disk with the most recent messages, in two files that are used alternately.
+    """A journal of the most recent messages on disk, which alternates between two files.
 
-    Each file holds at most half of the time and half of the bytes that the black box keeps.
+    Each file holds at most half the time and half the bytes kept by the black box.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -396,7 +399,7 @@ class _Journal:
         self._written: _Written | None = None
 
     def add(self, fresh: list[BlackBoxMessage], header: RecordingHeader, settings: str, *, most_ns: int) -> None:
-        """Write messages to the disk immediately. If writing fails, the journal ends and the run continues."""
+        """Write messages to disk at once. If this fails, the journal ends but the run continues."""
         now_ns = time.monotonic_ns()
         try:
             if self._file is None or now_ns - self._begun_ns > most_ns // 2 or self._file.tell() > BYTES_MAX // 2:
@@ -420,10 +423,10 @@ class _Journal:
         return self._folder / f".{PREFIX}{JOURNAL}{self._current}{PART}"
 
     def close(self, *, in_use: bool = False) -> None:
-        """Delete the journal after a normal end of the run.
+        """Delete the journal after the run has ended normally.
 
         Args:
-            in_use: True if another thread is still writing. The current file then stays open, but is still deleted.
+            in_use: True if another thread is still writing. The current file is then not closed, but is deleted anyway.
         """
         if self._file is not None and not in_use:
             with suppress(OSError):
@@ -435,7 +438,7 @@ class _Journal:
 
 
 def _find_cut(folder: Path) -> None:
-    """Rename the journals of a killed run to permanent files."""
+    """If a run was killed, rename its journals as permanent files."""
     for journal in sorted(folder.glob(f".{PREFIX}{JOURNAL}*{PART}"), key=lambda path: path.stat().st_mtime):
         with suppress(OSError), journal.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -445,9 +448,9 @@ def _find_cut(folder: Path) -> None:
 
 
 def make_room(folder: Path) -> None:
-    """Delete files of the most frequent kind until the folder contains at most `FILES_MAX` files.
+    """Delete files of the most common kind until at most `FILES_MAX` are left in the folder.
 
-    The newest file in the folder is kept. The first file of a kind is deleted only after the others of that kind.
+    The newest file in the folder is kept. The first file of any kind is deleted only after all others of that kind.
     """
     kinds: dict[str, list[Path]] = {}
     *earlier, _ = sorted(folder.glob(f"{PREFIX}*.mcap"), key=lambda path: (_number(path), path.name)) or [folder]
@@ -460,13 +463,13 @@ def make_room(folder: Path) -> None:
 
 
 def _number(path: Path) -> int:
-    """Return the number in a file's name, or 0."""
+    """Return the number in a file's name, or 0 if there is none."""
     first = path.name.removeprefix(".").removeprefix(PREFIX).partition("-")[0]
     return int(first) if first.isdecimal() else 0
 
 
 def _sweep(folder: Path) -> None:
-    """Delete the unfinished files of killed processes."""
+    """Delete unfinished files from killed processes."""
     for part in folder.glob(f".{PREFIX}*{PART}"):
         with suppress(OSError), part.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

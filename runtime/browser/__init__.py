@@ -1,1 +1,1 @@
-"""Scripts that make a web browser the viewer and the display, and pages that show one solution."""
+"""Scripts that turn a web browser into the viewer and the display, and pages that show one solution."""

@@ -1,4 +1,4 @@
-"""Exchange eye positions, camera pictures and layers between the refresh loop and live pages."""
+"""Exchange eye positions, camera pictures and layers between the refresh loop and all live pages."""
 
 from __future__ import annotations
 
@@ -15,58 +15,58 @@ import numpy as np
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, EyePoints, PanelFrame, SensorFrame
 
-SAMPLES_MAX = 256  # maximum number of samples that wait for the sensor
-CAPTURES_MAX = 512  # number of captures whose time on the page's clock is stored
-OVERLAY_PX = 320  # width of camera pictures that are sent to pages
+SAMPLES_MAX = 256  # maximum number of samples waiting for the sensor
+CAPTURES_MAX = 512  # for how many captures the time on the page's clock is stored
+OVERLAY_PX = 320  # width of the camera pictures sent to pages
 
 
 @dataclass(frozen=True, slots=True)
 class SeenEyes:
-    """Sample of eye positions that a page has sent."""
+    """A sample of eye positions sent by a page."""
 
-    eyes_m: F64 | None  # (2, 3) eyes in frame `stack`; None if there is no viewer
-    page_ms: float  # time of the sample on the page's clock
+    eyes_m: F64 | None  # (2, 3) eyes in the `stack` frame; None if there is no viewer
+    page_ms: float  # the sample's time on the page's clock
 
 
 @dataclass(eq=False)
 class BrowserLink:
-    """Passes data between the refresh loop and the pages that show the display.
+    """Passes data between the refresh loop and all pages that show the display.
 
-    The page that has been connected longest is the viewer, whose samples or camera pictures are used. All other pages
-    only watch. The link is thread-safe.
+    The page that has been connected longest is the viewer: only its samples or camera pictures are used, and all other
+    pages just watch. Thread-safe.
     """
 
-    stack: PanelStack  # stack that is shown at present
-    fov_deg: float  # horizontal field of view of target pictures
-    is_sensor: bool = True  # True if the viewer's page sends eye positions, False if a camera measures the eyes
-    noise_mm: float = 0.2  # standard deviation per axis of the simulated noise of the sensor
-    latency_ms: float = 0.0  # simulated latency of the sensor
+    stack: PanelStack  # the stack being shown
+    fov_deg: float  # the target pictures' horizontal field of view
+    is_sensor: bool = True  # True if the viewer's page sends eye positions, False if they are measured with a camera
+    noise_mm: float = 0.2  # simulated sensor noise, standard deviation along each axis
+    latency_ms: float = 0.0  # simulated sensor latency
     is_camera: bool = False  # True if the viewer's page sends camera pictures
-    camera_fov_deg: float = 65.0  # horizontal field of view of the page's camera; 65 degrees is typical for webcams
-    wishes: dict[str, float] = field(default_factory=dict)  # requested changes that require a restart: gap_mm, camera
-    moment: Any = None  # layers and target pictures of the newest measured refresh
-    found: dict[str, Any] | None = None  # newest camera picture, with the pupils that were found in the picture
-    frame: PanelFrame | None = None  # newest frame that was given to the panels
-    shown: tuple[PanelFrame | None, dict[str, Any]] = (None, {})  # frame and status of the newest refresh
-    news: dict[object, Callable[[], None]] = field(default_factory=dict)  # functions to call when data changes, by page
+    camera_fov_deg: float = 65.0  # the page camera's horizontal field of view; 65 degrees is typical of webcams
+    wishes: dict[str, float] = field(default_factory=dict)  # changes requested that need a restart: gap_mm, camera
+    moment: Any = None  # layers and target pictures from the latest measured refresh
+    found: dict[str, Any] | None = None  # latest camera picture and the pupils found in it
+    frame: PanelFrame | None = None  # latest frame presented on the panels
+    shown: tuple[PanelFrame | None, dict[str, Any]] = (None, {})  # frame and status of the latest refresh
+    news: dict[object, Callable[[], None]] = field(default_factory=dict)  # called when data changes, by page
     _arrived: threading.Condition = field(default_factory=threading.Condition)
-    _picture: tuple[bytes, float] | None = None  # encoded camera picture, and its time on the page's clock
+    _picture: tuple[bytes, float] | None = None  # encoded camera picture and its time on the page's clock
     _samples: deque[SeenEyes] = field(default_factory=lambda: deque(maxlen=SAMPLES_MAX))
     _captures: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=CAPTURES_MAX))
 
     def is_viewer(self, page: object) -> bool:
-        """Return True if `page` is the viewer's page, which has been connected longest."""
+        """Return True if `page` is the viewer's page, the one connected longest."""
         return next(iter(self.news), None) is page
 
     def see(self, eyes_m: Any, page_ms: float) -> None:
         """Add a sample of eye positions.
 
         Args:
-            eyes_m: (2, 3) eyes in frame `stack`, or None if there is no viewer.
-            page_ms: Time of the sample on the page's clock.
+            eyes_m: Eyes in the `stack` frame, shape (2, 3), or None if there is no viewer.
+            page_ms: The sample's time on the page's clock.
 
         Raises:
-            ValueError: The sample does not consist of two eyes in front of the front panel.
+            ValueError: The sample is not a pair of eyes in front of the front panel.
         """
         eyes = None
         if eyes_m is not None:
@@ -78,12 +78,12 @@ class BrowserLink:
             self._arrived.notify()
 
     def seen(self, timeout_s: float) -> list[SeenEyes]:
-        """Remove the unread samples from the queue and return them, oldest first.
+        """Remove all unread samples from the queue and return them, oldest first.
 
-        If there are no unread samples, wait for a sample.
+        If there are none, wait for one.
 
         Args:
-            timeout_s: Longest time to wait in seconds. The result is empty if no sample arrives.
+            timeout_s: How long to wait at most, in seconds. If no sample arrives, the result is empty.
         """
         with self._arrived:
             if not self._samples:
@@ -93,23 +93,23 @@ class BrowserLink:
         return samples
 
     def send_picture(self, coded: bytes, page_ms: float) -> None:
-        """Store a camera picture in place of the previous picture, even if the previous picture is unread.
+        """Store a camera picture in place of the previous one, even if that one has not been read.
 
         Args:
-            coded: Encoded picture.
-            page_ms: Time of the picture on the page's clock.
+            coded: The encoded picture.
+            page_ms: The picture's time on the page's clock.
         """
         with self._arrived:
             self._picture = coded, page_ms
             self._arrived.notify()
 
     def picture(self, timeout_s: float) -> tuple[bytes, float] | None:
-        """Remove and return the newest unread camera picture and its time on the page's clock.
+        """Return the unread camera picture and its time on the page's clock, and forget the picture.
 
-        If there is no unread picture, wait for a picture.
+        If there is none, wait for one.
 
         Args:
-            timeout_s: Longest time to wait in seconds. The result is None if no picture arrives.
+            timeout_s: How long to wait at most, in seconds. If no picture arrives, the result is None.
         """
         with self._arrived:
             if self._picture is None:
@@ -118,10 +118,10 @@ class BrowserLink:
         return taken
 
     def reporting(self, finder: Any) -> Callable[[SensorFrame], EyePoints | None]:
-        """Wrap an eye finder in a function that also sends its results to the pages.
+        """Wrap an eye finder in a function that also sends the results to all pages.
 
         Args:
-            finder: Eye finder for the pictures of a page's camera.
+            finder: Eye finder for pictures from a page's camera.
         """
 
         def find(frame: SensorFrame) -> EyePoints | None:
@@ -141,21 +141,21 @@ class BrowserLink:
         return find
 
     def captured(self, capture_ns: int, page_ms: float) -> None:
-        """Store the time of a capture on the page's clock."""
+        """Store a capture's time on the page's clock."""
         self._captures.append((capture_ns, page_ms))
 
     def page_ms_of(self, capture_ns: int) -> float | None:
-        """Return the page time of the newest sample captured no later than `capture_ns`.
+        """Return the page time of the latest sample captured at or before `capture_ns`.
 
-        The time is on the page's clock. The result is None if no such sample is stored.
+        This is a time on the page's clock. Returns None if no such sample is stored.
         """
         return next((page_ms for ns, page_ms in reversed(tuple(self._captures)) if ns <= capture_ns), None)
 
     def refreshed(self, account: dict[str, Any]) -> None:
-        """Publish a refresh of the newest frame to the pages.
+        """Publish the latest frame and its refresh to all pages.
 
         Args:
-            account: Status of the refresh, which pages show.
+            account: The refresh's status, for pages to show.
         """
         self.shown = self.frame, account
         self._notify()

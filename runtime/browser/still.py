@@ -1,4 +1,4 @@
-"""Make self-contained HTML pages with the layers of a solution and a script that renders views."""
+"""Make self-contained HTML pages that hold a solution's layers and a script to render views of them."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from runtime.support.artifacts import png_bytes, to_json
 from runtime.support.threads import parallel_map
 
 WEBP_MAX_PX = 16383
-EXTRA_BYTES = 60 << 10  # limit of a page's size beyond the size of its layers as PNG files
+EXTRA_BYTES = 60 << 10  # how much larger a page may be than its layers as PNG files
 PAGE_BYTES = 8_000_000  # maximum size of a page
-LAYERS_BYTES = 6_400_000  # maximum size of lossless layers in a page; larger layers (4K) are compressed with losses
-QUALITY_BYTES = 512  # size reserved for the lines that report the quality of the compression
-QUALITIES = (92, 84, 76, 66, 54)  # AVIF qualities; the first quality at which the pictures fit is used
+LAYERS_BYTES = 6_400_000  # maximum size of lossless layers in a page; larger ones (4K) are compressed lossily
+QUALITY_BYTES = 512  # space reserved for the lines that state how good the compressed pictures are
+QUALITIES = (92, 84, 76, 66, 54)  # AVIF qualities, tried in this order until the pictures fit
 CODINGS: dict[str, dict[str, Any]] = {
     "png": {},
     "webp": {"lossless": True, "method": 2, "quality": 20},
@@ -36,7 +36,7 @@ CODINGS: dict[str, dict[str, Any]] = {
 
 
 def asset(name: str) -> str:
-    """Return the text of a file in the assets folder."""
+    """Return the text of an assets file."""
     return (files("runtime.browser") / "assets" / name).read_text(encoding="utf-8")
 
 
@@ -51,21 +51,21 @@ def viewer_html(
     relief: F32 | None = None,
     follows: bool = True,
 ) -> str:
-    """Return the HTML text of a viewer page for one solution.
+    """Return the HTML of a viewer page for one solution.
 
-    Layers are stored without losses if they fit in `LAYERS_BYTES`. Otherwise they are stored as AVIF, and the page
+    The layers are stored losslessly if they fit into `LAYERS_BYTES`. If not, they are stored as AVIF, and the page
     states their PSNR.
 
     Args:
-        layers: (N, h, w, 3 or 4) layers, rear to front.
-        wanted: Target picture (h, w, 3) of each eye, which is compressed to fit into the rest of the page. An empty
-            sequence means that the page has no target pictures.
-        stack: Panels of the display.
-        eyes_m: (2, 3) eyes that the layers were solved for, in frame `stack`.
-        fov_deg: Horizontal field of view of the target pictures.
-        text: Title of the page, followed by lines of text to show below the controls.
-        relief: (h, w) relief of the content (`optics.relief`), or None if the relief is unknown.
-        follows: Align the outer panels to the viewer's head until the user switches the alignment off.
+        layers: Layers, rear to front, shape (N, h, w, 3 or 4).
+        wanted: Each eye's target picture (h, w, 3), compressed so that it fits into the rest of the page. If empty, the
+            page has no target pictures.
+        stack: The display's panels.
+        eyes_m: Eyes that the layers were solved for, shape (2, 3), in the `stack` frame.
+        fov_deg: The target pictures' horizontal field of view.
+        text: The page's title, followed by lines of text to show below the controls.
+        relief: The content's relief (`optics.relief`), shape (h, w), or None if it is unknown.
+        follows: True to align the outer panels to the viewer's head until the user switches this off.
     """
     title, *lines = text
     scene = {"stack": stack_table(stack), "eyes_m": eyes_m, "fov_deg": fov_deg, "title": title, "follows": follows}
@@ -74,7 +74,7 @@ def viewer_html(
         deflated = base64.b64encode(zlib.compress(half_floats(relief), 9)).decode()
         scene["relief"] = {"size": relief.shape[::-1], "deflated": deflated}
     parts = {"TITLE": html.escape(title), "CSS": asset("look.css"), "SCRIPT": _script(), "SCENE": _embedded(scene)}
-    quick = not wanted  # for a stopped run, layers take a third of the time to encode and 1.5 to 2 times the space
+    quick = not wanted  # after a stopped run, encode layers in a third of the time and 1.5 to 2 times the space
     png_size = 0 if quick else sum(map(len, parallel_map(png_bytes, list(layers))))
     room, coded = min(PAGE_BYTES, EXTRA_BYTES + png_size), 0.0
     stored = parallel_map(partial(_exact, quick=quick), list(layers)) if png_size < 2 * LAYERS_BYTES else []
@@ -91,12 +91,12 @@ def viewer_html(
 
 
 def half_floats(relief: F32) -> bytes:
-    """Encode a relief (h, w) for the script as little-endian 16-bit floats in row-major order."""
+    """Encode a relief (h, w) for the script, as little-endian 16-bit floats in row-major order."""
     return np.clip(relief, -1e3, 1e3).astype("<f2").tobytes()
 
 
 def stack_table(stack: PanelStack) -> dict[str, Any]:
-    """Return a table for the script with the geometry of the stack and the 8-bit value of panels at rest."""
+    """Return the stack's geometry and the 8-bit value of a panel at rest, as a table for the script."""
     fields = ("width_m", "height_m", "x_m", "width_px", "height_px")
     table: dict[str, Any] = {name: getattr(stack, name) for name in fields}
     table["rest_code"] = rest_code(stack.count)
@@ -107,16 +107,16 @@ def stack_table(stack: PanelStack) -> dict[str, Any]:
 
 @cache
 def _script() -> str:
-    """Concatenate the JavaScript modules into one script without comments, imports and exports."""
+    """Concatenate the JavaScript modules into one script, leaving out comments, imports and exports."""
     text = "\n".join(asset(name) for name in ("display.js", "look.js", "still.js"))
     return re.sub(r"^ *//.*\n| +// .*$|^ +|^export |^import .*\n", "", text, flags=re.MULTILINE)
 
 
 def _exact(layer: U8, *, quick: bool) -> str:
-    """Encode a layer without losses as a data URL.
+    """Encode a layer losslessly as a data URL.
 
-    The format is WebP if possible, because WebP files are a third smaller than PNG files, which offsets the growth by
-    base64.
+    The format is WebP if possible, because a WebP file is a third smaller than a PNG file, which makes up for the space
+    added by base64.
     """
     if max(layer.shape) > WEBP_MAX_PX:
         return _url(layer, "png")
@@ -124,15 +124,15 @@ def _exact(layer: U8, *, quick: bool) -> str:
 
 
 def _stored(pictures: Sequence[U8], room: int, *, qualities: Sequence[int] = QUALITIES) -> tuple[list[str], float]:
-    """Encode pictures as AVIF at the first quality at which they fit into `room` bytes.
+    """Encode pictures as AVIF, using the first quality that lets them fit into `room` bytes.
 
     Args:
-        pictures: Pictures (h, w, 3 or 4).
-        room: Maximum total size in bytes. If no quality fits, the last quality is used.
+        pictures: Pictures, shape (h, w, 3 or 4).
+        room: Maximum total size in bytes. If the pictures do not fit at any quality, the last one is used.
         qualities: AVIF qualities in descending order.
 
     Returns:
-        Data URLs of the pictures, and the mean squared error of the compressed pictures.
+        The pictures as data URLs, and their mean squared error after compression.
     """
     urls: list[str] = []
     for quality in qualities:
@@ -151,5 +151,5 @@ def _url(picture: U8, kind: Literal["png", "webp", "avif"], **options: int) -> s
 
 
 def _embedded(value: Any) -> str:
-    """Encode a value as JSON without the character `<`, which could end the script element."""
+    """Encode a value as JSON, escaping `<`, which could otherwise end the script element."""
     return to_json(value).replace("<", "\\u003c")

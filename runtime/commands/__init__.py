@@ -1,1 +1,1 @@
-"""The command line: one module per command. Heavy imports are inside the functions."""
+"""The command line, with one module for each command. Heavy imports are inside the functions."""

@@ -1,4 +1,4 @@
-"""Typer app with all commands. Each command imports its dependencies when it runs."""
+"""Typer app with all commands. Each command imports its dependencies only when it runs."""
 
 from __future__ import annotations
 
@@ -80,4 +80,4 @@ def options(
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="print the version and exit")
     ] = False,
 ) -> None:
-    """Accept options that come before a command. `--help` shows the app's help, not this text."""
+    """Accept options given before a command. `--help` shows the app's help, not this text."""

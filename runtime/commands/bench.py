@@ -16,7 +16,7 @@ def bench(
     out: Annotated[Path | None, typer.Option(help="write the measurement to this JSON file")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
 ) -> None:
-    """Measure run time, memory and light PSNR of the shipped models, or compare two measurements.
+    """Measure the shipped models' run time, memory and light PSNR, or compare two measurements.
 
     Example: phasestack bench --out bench.json
 
@@ -45,9 +45,9 @@ def compare(
     new: Annotated[Path, typer.Argument(help="JSON file of the later measurement")],
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
 ) -> None:
-    """List every figure that changed by more than the noise. Exits with 1 if a figure got worse.
+    """List every figure that changed by more than the noise. Exits with 1 if any figure got worse.
 
-    Times are not compared if the machine was too busy during either measurement.
+    If the machine was too busy during either measurement, times are not compared.
 
     Example: phasestack bench compare old.json new.json
     """

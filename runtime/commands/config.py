@@ -4,10 +4,10 @@ from __future__ import annotations
 
 
 def config() -> None:
-    """Print a complete configuration in TOML, which lists every setting with its default and description.
+    """Print a complete configuration in TOML, with the default and a description for every setting.
 
-    Relative paths are resolved against the configuration file's folder. `phasestack doctor --config FILE` checks a
-    configuration.
+    Relative paths are resolved against the configuration file's folder. To check a configuration, use `phasestack
+    doctor --config FILE`.
 
     Example: phasestack config > phasestack.toml
     """

@@ -1,4 +1,4 @@
-"""`phasestack ctl` and `phasestack status`: control the running daemon and show its state."""
+"""`phasestack ctl` and `phasestack status`: control the running daemon, and show its state."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def scene(
 ) -> None:
     """Show another scene: a built-in one such as `demo`, or a file or folder on this PC (`./NAME`).
 
-    The current scene stays until the new one has loaded. If loading fails, the scene does not change and the exit code
+    The current scene stays until the new one has loaded. If loading fails, the scene is not changed and the exit code
     is 2.
 
     Example: phasestack ctl scene demo
@@ -55,7 +55,7 @@ def place(
 ) -> None:
     """Move, turn or scale the current scene.
 
-    Omitted options keep their values. The next scene starts in its configured placement.
+    If an option is omitted, its value stays the same. The next scene starts with the configured placement.
 
     Example: phasestack ctl place --scale 1.2 --offset 0.01 0 -0.02 --turntable 3
     """
@@ -75,7 +75,7 @@ def model(
 ) -> None:
     """Switch to another model.
 
-    The current model runs until the new one has loaded, and stays in use if loading fails.
+    The current model is used until the new one has loaded, and stays in use if loading fails.
 
     Example: phasestack ctl model best
     """
@@ -91,7 +91,7 @@ PLAIN = {
     "reload": "Reload the configuration file. If it is invalid, the old configuration stays in use.\n\n"
     "A scene, model or placement set by `ctl` stays unless the file has changed that setting.",
     "blackbox": "Save the last two minutes (eyes, states, times, log) as an MCAP file and print its name.",
-}  # commands without an argument
+}  # commands that take no argument
 
 
 def _add_plain(name: str, meaning: str) -> None:
@@ -107,7 +107,7 @@ for _name, _meaning in PLAIN.items():
 def tell(request: dict[str, Any], config: Path | None) -> None:
     """Send a request and print the new state. Exits with 1 if no daemon answers.
 
-    Raises InputError, for which the exit code is 2, if the daemon refuses the request.
+    If the daemon refuses the request, raises InputError, which leads to exit code 2.
     """
     from runtime.daemon.client import ANSWERED_WITHIN_S, NotRunning, ask, sockets
     from runtime.errors import InputError
@@ -125,7 +125,7 @@ def tell(request: dict[str, Any], config: Path | None) -> None:
 
 
 def _advised(error: Exception) -> str:
-    """Return the message for a request that got no answer, with advice for the user."""
+    """Return the message for a request that was not answered, including advice for the user."""
     from runtime.daemon.client import unit_advice
 
     advice = unit_advice()
@@ -138,9 +138,9 @@ def status(
     config: Config = None,
     as_json: Annotated[bool, typer.Option("--json", help="print the status as one JSON object")] = False,
 ) -> None:
-    """Show the daemon's state, the reason for it, rates, eye positions, uncertainty, times and faults.
+    """Show the daemon's state and the reason for it, rates, eye positions, uncertainty, times and faults.
 
-    Exits with 1 if no daemon answers or if its loop has hung for five seconds.
+    Exits with 1 if no daemon answers, or if its loop has been hanging for five seconds.
 
     Example: phasestack status --json
     """

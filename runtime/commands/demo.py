@@ -9,8 +9,8 @@ from typing import Annotated
 
 import typer
 
-FRAMES, MEASURED_EVERY = 42, 14  # refreshes; 0.7 s is long enough for the head to start moving
-LONGEST_S, LEAST = 45.0, 15  # time limit of the demo; minimum number of refreshes
+FRAMES, MEASURED_EVERY = 42, 14  # in refreshes; in 0.7 s, the head has started to move
+LONGEST_S, LEAST = 45.0, 15  # the demo's time limit; minimum number of refreshes
 
 
 def demo(
@@ -20,9 +20,9 @@ def demo(
     ] = FRAMES,
     as_json: Annotated[bool, typer.Option("--json", help="print the summary as one JSON object")] = False,
 ) -> None:
-    """Play a built-in recording of a moving head through the whole pipeline, without a screen.
+    """Play a built-in recording of a moving head through the whole pipeline without a screen.
 
-    By default the demo ends after 42 refreshes. On a slow machine it ends after 45 s and at least 15 refreshes.
+    By default, the demo ends after 42 refreshes or, on a slow machine, after 45 s and at least 15 refreshes.
 
     Example: phasestack demo --out out/demo
     """
@@ -31,18 +31,18 @@ def demo(
     from runtime.daemon.drive import drive, print_summary
 
     class InTime(Host):
-        """Host that ends the demo after a time limit, for slow machines."""
+        """Host that ends the demo after a time limit on slow machines."""
 
         def __init__(self) -> None:
             self._ends_s = time.monotonic() + LONGEST_S if frames <= FRAMES else float("inf")
-            self._asked = 0  # number of calls of `stop_reason`, one per refresh
+            self._asked = 0  # how often `stop_reason` was called, once per refresh
 
         def stop_reason(self) -> str:
             self._asked += 1
             is_over = self._asked >= LEAST and time.monotonic() > self._ends_s
             return f"the time limit of {LONGEST_S:g} s is up" if is_over else ""
 
-    every = MEASURED_EVERY if frames <= 4 * FRAMES else 60  # refreshes; one measurement takes as long as ten refreshes
+    every = MEASURED_EVERY if frames <= 4 * FRAMES else 60  # one measurement takes as long as ten refreshes
     settings = changed(Settings(), "loop", {"evaluate_every": every}, source="demo")
     settings = changed(settings, "content", {"scene": "room"}, source="demo")
     summary = drive(settings, RunOptions(max_speed=True, measure=True, frames=frames, out=out), InTime())

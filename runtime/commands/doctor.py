@@ -1,6 +1,6 @@
-"""`phasestack doctor`: check everything that the configuration needs and suggest remedies for faults.
+"""`phasestack doctor`: check everything needed by the configuration, and suggest how to fix problems.
 
-Each check is a small function that takes the settings and yields rows of the table.
+Each check is a small function that takes the settings and yields table rows.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ if TYPE_CHECKING:
     from runtime.model.device import SolverBackend
 
 Verdict = Literal["ok", "warn", "fail", "skip"]
-CHECK_SENSOR_FOR_S = 3.0  # time limit for a sensor's first sample
+CHECK_SENSOR_FOR_S = 3.0  # how long to wait for a sensor's first sample
 SERVICE_CONFIG = Path("/etc/phasestack/phasestack.toml")
-SLOW_MS = 150.0  # solution time above which moving viewers see a worse picture (docs/performance.md)
-MEASURED_MS = 2000.0  # a solution expected to take longer is not timed at full size
-NO_DEVICE = ("replay", "fixed")  # drivers that need no device
+SLOW_MS = 150.0  # if a solution takes longer, moving viewers see a worse picture (docs/performance.md)
+MEASURED_MS = 2000.0  # if a solution is expected to take longer, it is not timed at full size
+NO_DEVICE = ("replay", "fixed")  # drivers that do not need a device
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """Result of one check."""
+    """The result of one check."""
 
     name: str
     state: Verdict
     detail: str  # what was found
-    remedy: str = ""  # advice for the user; empty if there is nothing to do
+    remedy: str = ""  # what the user can do; empty if there is nothing to do
 
 
 def doctor(
@@ -54,7 +54,7 @@ def doctor(
 ) -> None:
     """Check the settings, sensor, permissions, OpenGL, monitors, scene, model, calibration and service.
 
-    Anything unusual but usable is a warning. Exits with 1 if a check fails.
+    Anything unusual that still works gives a warning. Exits with 1 if any check fails.
 
     Example: phasestack doctor --config /etc/phasestack/phasestack.toml
 
@@ -78,9 +78,9 @@ def doctor(
 
 
 def _become_service() -> None:
-    """Switch to the user, groups and environment of the service, but not to its sandbox.
+    """Switch to the service's user, groups and environment, but not to its sandbox.
 
-    Raises InputError if the service is not installed or this user is not allowed to switch.
+    Raises InputError if the service is not installed or if this user is not allowed to switch.
     """
     import grp
     import pwd
@@ -107,9 +107,9 @@ Check = Callable[["Settings"], Iterator[Row]]
 
 
 def examine(settings: Settings) -> list[Row]:
-    """Run all checks and return the rows of the table.
+    """Run all checks and return the table rows.
 
-    An unexpected exception becomes a failed row and does not prevent the other checks.
+    If a check raises an unexpected exception, its row is marked as failed and the other checks still run.
     """
     rows: list[Row] = []
     for name, check in CHECKS.items():
@@ -126,7 +126,7 @@ def examine(settings: Settings) -> list[Row]:
 
 
 def sensor(settings: Settings) -> Iterator[Row]:
-    """Check that the configured driver opens and delivers samples."""
+    """Check that the configured driver can be opened and delivers samples."""
     from runtime.clock import MonotonicClock
     from runtime.errors import EndOfRecording, SensorLost, SensorTimeout
     from runtime.eyes.calibration import load_calibration
@@ -158,7 +158,7 @@ def sensor(settings: Settings) -> Iterator[Row]:
 
 
 def usb(settings: Settings) -> Iterator[Row]:
-    """Check depth cameras on USB: port speed, permissions and driver."""
+    """Check the port speed, permissions and driver of each USB depth camera."""
     from runtime.errors import MissingPart
     from runtime.sensor.usb_devices import find_devices
 
@@ -180,7 +180,7 @@ def usb(settings: Settings) -> Iterator[Row]:
 
 
 def opengl(settings: Settings) -> Iterator[Row]:
-    """Check that OpenGL works without a screen, which content and offscreen panels require."""
+    """Check that OpenGL works without a screen, as needed for content and offscreen panels."""
     from runtime.support.gl import describe, offscreen_context
 
     context = offscreen_context()
@@ -198,7 +198,7 @@ def opengl(settings: Settings) -> Iterator[Row]:
 
 
 def monitors(settings: Settings) -> Iterator[Row]:
-    """Check that every configured panel has its monitor connected."""
+    """Check that every configured panel's monitor is connected."""
     from runtime.errors import InputError, PanelLost
     from runtime.panels.monitors import bind, check_modes, refresh_difference
     from runtime.panels.registry import panel_settings
@@ -245,7 +245,7 @@ def content(settings: Settings) -> Iterator[Row]:
 
 
 def model(settings: Settings) -> Iterator[Row]:
-    """Check that the network loads, fits the stack and finds its execution provider. Time a solution."""
+    """Check that the network loads, fits the stack and has its execution provider. Times a solution."""
     import cv2
 
     from runtime.model.backends import choose
@@ -273,7 +273,7 @@ def model(settings: Settings) -> Iterator[Row]:
 
 
 def _rate(predictor: Predictor, backend: SolverBackend, settings: Settings) -> Row:
-    """Measure how many full solutions per second this machine computes, for the slowest kind of picture."""
+    """Measure how many full solutions this machine computes per second with the slowest kind of picture."""
     from dataclasses import replace
 
     from runtime.model.backends import solution_ms
@@ -295,7 +295,7 @@ def _rate(predictor: Predictor, backend: SolverBackend, settings: Settings) -> R
 
 
 def calibration(settings: Settings) -> Iterator[Row]:
-    """Check that the calibration is a similarity. A real sensor must not use the demo's calibration."""
+    """Check that the calibration is a similarity and, with a real sensor, not the demo's calibration."""
     from runtime.eyes.calibration import load_calibration
     from runtime.sensor.base import Sensor
 
@@ -321,7 +321,7 @@ def calibration(settings: Settings) -> Iterator[Row]:
 
 
 def service(settings: Settings) -> Iterator[Row]:
-    """Check that the running daemon, if there is one, is healthy."""
+    """Check that the daemon, if one is running, is healthy."""
     from runtime.daemon.client import HUNG_AFTER_S
 
     answer = _daemon(settings)
@@ -341,7 +341,7 @@ def service(settings: Settings) -> Iterator[Row]:
 
 
 def _daemon(settings: Settings) -> dict[str, Any] | None:
-    """Return the running daemon's status, or None if no daemon runs."""
+    """Return the running daemon's status, or None if no daemon is running."""
     from runtime.daemon.client import NotRunning, ask, candidates
 
     try:

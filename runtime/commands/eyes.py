@@ -9,7 +9,7 @@ import typer
 
 from runtime.support.options import number
 
-JSON_S = 2.0  # time for which a live sensor is watched with --json
+JSON_S = 2.0  # how long a live sensor is watched with --json
 
 
 def eyes(
@@ -29,7 +29,7 @@ def eyes(
         bool, typer.Option("--json", help="print one JSON object; a live sensor is watched for two seconds")
     ] = False,
 ) -> None:
-    """Find the viewer's pupils and their uncertainty. With --out, also draw them.
+    """Find the viewer's pupils and how uncertain their positions are. With --out, also draw them.
 
     Example: phasestack eyes me.jpg room.mp4 --out out/eyes
     """

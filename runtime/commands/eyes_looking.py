@@ -1,4 +1,4 @@
-"""Implementation of `phasestack eyes`, which finds pupils in pictures and draws overlays."""
+"""Implementation of `phasestack eyes`: find pupils in pictures, and draw overlays."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from runtime.support.film import VIDEOS, open_film
 from runtime.support.picture_file import read_image
 
 RECORDING = ".mcap"
-OVERLAY_MIN_PX = 640  # minimum length of an overlay's longer side
-PRIVATE = 0o600  # file mode for pictures of faces
+OVERLAY_MIN_PX = 640  # an overlay's longer side has at least this many pixels
+PRIVATE = 0o600  # file mode for pictures that show faces
 GREEN, RED, WHITE = (60, 220, 60), (230, 60, 60), (255, 255, 255)
 Row = dict[str, Any]
 
 
 class Watcher:
-    """Eye finder that reports the result for each frame as a row of values."""
+    """Finds eyes, and reports the result for each frame as a row of values."""
 
     def __init__(self, settings: Settings) -> None:
-        cv2.setNumThreads(1)  # as in the display loop
+        cv2.setNumThreads(1)  # like the display loop
         self._finder = EyeFinder(settings)
         self.forget = self._finder.forget
 
@@ -46,7 +46,7 @@ class Watcher:
         ms = 1e3 * (time.perf_counter() - begin)
         pupils, reason = self._finder.pupils, self._finder.reason
         if pupils is not None and frame.intrinsics is None:
-            reason = ""  # without intrinsics, distances cannot be measured
+            reason = ""  # distances cannot be measured without intrinsics
         if frame.colour is None:
             pupils, reason = (
                 None,
@@ -68,17 +68,17 @@ class Watcher:
 def look_at_files(
     files: list[Path], settings: Settings, *, sequence: bool, rate_hz: float, out: Path | None
 ) -> list[Row]:
-    """Find the eyes in every frame of the files and return a row for each frame.
+    """Find the eyes in every frame of these files. Returns a row for each frame.
 
     Args:
-        files: Pictures, films or recordings, in the order of the rows.
-        settings: Settings of the eye finder.
-        sequence: Follow the viewer from one still picture to the next.
+        files: Pictures, films or recordings, in the same order as the rows.
+        settings: Settings for the eye finder.
+        sequence: True to follow the viewer from one still picture to the next.
         rate_hz: Frame rate of still pictures, and of films that do not give a rate.
-        out: Folder for overlays, which show the eyes that were found. None: draw no overlays.
+        out: Folder for overlays, which show the eyes found. If None, no overlays are drawn.
 
     Raises:
-        InputError: A file cannot be read or decoded. `out` is then unchanged.
+        InputError: A file cannot be read or decoded. In this case, `out` is left unchanged.
     """
     watcher, rows, follows = Watcher(settings), [], False
     with OutputFolder(out) if out is not None else nullcontext() as folder:
@@ -97,11 +97,11 @@ def look_at_files(
 
 
 def _frames(path: Path, place: int, rate_hz: float) -> Iterator[SensorFrame]:
-    """Yield the frames of a file.
+    """Yield all frames in a file.
 
     Args:
-        path: Picture, film or recording.
-        place: Index of a still picture in a sequence, which determines its time.
+        path: A picture, film or recording.
+        place: A still picture's index in the sequence, used to compute its time.
         rate_hz: Frame rate of still pictures, and of films that do not give a rate.
 
     Raises:
@@ -110,7 +110,7 @@ def _frames(path: Path, place: int, rate_hz: float) -> Iterator[SensorFrame]:
     kind = path.suffix.lower()
     if kind == RECORDING:
         for frame in Recording(path).samples():
-            # Look at the pictures again, and ignore the recorded eyes.
+            # Ignore the recorded eyes, and look for them in the pictures again.
             yield frame if frame.colour is None else replace(frame, eyes=None)
     elif kind in VIDEOS:
         yield from _filmed(path, rate_hz)
@@ -119,8 +119,8 @@ def _frames(path: Path, place: int, rate_hz: float) -> Iterator[SensorFrame]:
 
 
 def _filmed(path: Path, rate_hz: float) -> Iterator[SensorFrame]:
-    """Yield the frames of a film. Raises InputError if the film cannot be decoded."""
-    with held_back():  # hides the messages of FFmpeg and OpenCV, which become one error
+    """Yield all frames in a film. Raises InputError if it cannot be decoded."""
+    with held_back():  # hides messages from FFmpeg and OpenCV, which become one error
         capture = open_film(path)
     try:
         rate = capture.get(cv2.CAP_PROP_FPS)
@@ -139,7 +139,7 @@ def _filmed(path: Path, rate_hz: float) -> Iterator[SensorFrame]:
 
 
 class _Overlays:
-    """Writer of overlays to a picture or film that only the owner can read. Does nothing without a path."""
+    """Writes overlays to a picture or film that only the owner can read. Without a path, does nothing."""
 
     def __init__(self, target: Path | None, is_still: bool, rate_hz: float) -> None:
         self._target, self._is_still, self._rate_hz = target, is_still, rate_hz
@@ -169,10 +169,10 @@ class _Overlays:
 
 
 def drawn(picture: U8, pupils: Pupils | None, row: Row) -> U8:
-    """Return a copy of a picture, enlarged if it is small, with the pupils, face and figures drawn on it."""
+    """Return a copy of a picture, enlarged if small, with the pupils, face and figures drawn on it."""
     scale = max(1.0, OVERLAY_MIN_PX / max(picture.shape[:2]))
     canvas = np.asarray(cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC), np.uint8)
-    bits = 4  # fractional bits of a coordinate
+    bits = 4  # number of fractional bits in a coordinate
 
     def place(point: Any) -> tuple[int, int]:
         x, y = np.rint((np.asarray(point) * scale - 0.5) * (1 << bits)).astype(int)
@@ -197,12 +197,12 @@ def drawn(picture: U8, pupils: Pupils | None, row: Row) -> U8:
 def look_at_sensor(
     settings: Settings, report: Callable[[Row], None], *, out: Path | None, seconds: float = np.inf
 ) -> None:
-    """Find the eyes in the sensor's frames until the time is up, a recording ends or Ctrl-C is pressed.
+    """Find the eyes in a sensor's frames until the time is up, a recording ends or Ctrl-C is pressed.
 
     Args:
-        settings: Settings of the sensor and the eye finder.
-        report: Function that is called with the row of each frame.
-        out: Folder for the newest overlay. None: draw no overlays.
+        settings: Settings for the sensor and the eye finder.
+        report: Function called with each frame's row.
+        out: Folder for the latest overlay. If None, no overlays are drawn.
         seconds: Time limit in seconds.
 
     Raises:

@@ -1,7 +1,7 @@
-"""Guard around every command. Turns any failure into an exit code and at most one line on stderr.
+"""Run each command so that any failure becomes an exit code and at most one line on stderr.
 
-The exit codes are 0 (success), 1 (a check failed), 2 (wrong usage or input), 70 (a bug; the line names a file with the
-traceback), 75 (a failure that may be temporary), 130 (Ctrl-C) and 141 (stdout was closed).
+The exit codes are 0 (success), 1 (a check failed), 2 (wrong usage or input), 70 (a bug; the line names a file that
+contains the traceback), 75 (a failure that may be temporary), 130 (Ctrl-C) and 141 (stdout was closed).
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ INTERRUPTED, BAD_INPUT, OWN_ERROR, MAY_PASS, STDOUT_CLOSED = 130, 2, 70, 75, 141
 
 
 def run_guarded(*, interrupts_leave: bool) -> None:
-    """Run the command that is named on the command line, then exit the process.
+    """Run the command named on the command line, then exit the process.
 
     Args:
-        interrupts_leave: True if Ctrl-C has so far ended the process immediately. It then raises KeyboardInterrupt
-            while the command runs. False leaves the handling of Ctrl-C unchanged.
+        interrupts_leave: True if Ctrl-C has ended the process immediately up to now. While the command runs, it then
+            raises KeyboardInterrupt. False leaves the handling of Ctrl-C unchanged.
     """
     _fill_standard_descriptors()
     try:
@@ -39,7 +39,7 @@ def run_guarded(*, interrupts_leave: bool) -> None:
             code = _code_of(app)
     except BaseException as error:
         code = _reported(error)
-    if interrupts_leave:  # a second interrupt exits immediately
+    if interrupts_leave:  # on a second interrupt, exit at once
         signal.signal(signal.SIGINT, lambda number, frame: os._exit(INTERRUPTED))
     code = _flushed(code)
     if _has_hung_thread():
@@ -48,12 +48,12 @@ def run_guarded(*, interrupts_leave: bool) -> None:
         logs.flush()
     else:
         atexit._run_exitfuncs()
-    # Skip Python's teardown, which takes time and aborts the process if a library's thread is still running.
+    # Skip Python's teardown, which takes time and would abort the process if a library's thread were still running.
     os._exit(code)
 
 
 def _interrupted(number: int, frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt, or exit during an import, in which Python would swallow the exception."""
+    """Raise KeyboardInterrupt, or exit if in the middle of an import, where Python would swallow it."""
     while frame is not None:
         if frame.f_code.co_filename.startswith("<frozen importlib"):
             os._exit(INTERRUPTED)
@@ -70,14 +70,14 @@ def _code_of(app: Any) -> int:
     try:
         app()
     except SystemExit as error:
-        if isinstance(error.__context__, BrokenPipeError):  # typer converts a closed stdout to SystemExit
+        if isinstance(error.__context__, BrokenPipeError):  # typer turns a closed stdout into SystemExit
             return STDOUT_CLOSED
         return int(error.code or 0)
     return 0
 
 
 def _reported(error: BaseException) -> int:
-    """Print the error that ended a command as one line, and return the exit code."""
+    """Print, in one line, the error that ended a command, and return the exit code."""
     from runtime.errors import PhasestackError, TransientError, one_line
     from runtime.support.extras import missing_extra
 
@@ -102,9 +102,9 @@ def _reported(error: BaseException) -> int:
 
 
 def _say(line: str) -> None:
-    with contextlib.suppress(OSError, ValueError):  # if stderr is closed, only the exit code remains
+    with contextlib.suppress(OSError, ValueError):  # if stderr is closed, only the exit code is left
         print(line, file=sys.stderr, flush=True)
-    if "NOTIFY_SOCKET" in os.environ:  # lets `phasestack status` show the error after the service has failed
+    if "NOTIFY_SOCKET" in os.environ:  # so that `phasestack status` can show it if the service fails
         with contextlib.suppress(ImportError):
             import sdnotify
 
@@ -112,9 +112,9 @@ def _say(line: str) -> None:
 
 
 def _flushed(code: int) -> int:
-    """Flush stdout and return the exit code, which is an error code if the flush fails.
+    """Flush stdout and return the exit code, or an error code if flushing fails.
 
-    If the flush were left to Python's shutdown, a failure would print a traceback.
+    If this were left to Python's shutdown, a failure would print a traceback.
     """
     try:
         sys.stdout.flush()
@@ -125,10 +125,10 @@ def _flushed(code: int) -> int:
 
 
 def _fill_standard_descriptors() -> None:
-    """Open /dev/null in place of each closed standard stream, which reserves the descriptor."""
+    """Open /dev/null in place of any closed standard stream, so that its descriptor is not reused."""
     while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
         os.set_inheritable(number, True)
     for name in ("stdout", "stderr"):
         stream: Any = getattr(sys, name) or os.fdopen(number, "w", encoding="utf-8", closefd=False)
-        stream.reconfigure(errors="backslashreplace")  # file names need not be UTF-8
+        stream.reconfigure(errors="backslashreplace")  # file names may not be UTF-8
         setattr(sys, name, stream)

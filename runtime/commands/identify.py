@@ -21,12 +21,12 @@ def identify(
         Path | None, typer.Option(help="configuration file; without it, every monitor shows a card")
     ] = None,
 ) -> None:
-    """Show a test card on each panel, with index, monitor, colour bars and an arrow that should point up.
+    """Show a test card on each panel: its index, monitor, colour bars and an arrow that should point up.
 
-    One panel at a time shows its card while the others are clear. Press Enter or n for the next panel, p for the
-    previous one and q to quit. Configured panels are rotated, mirrored and registered as in a run. If no panel is
-    configured, every monitor shows the line that identifies it in a configuration. (`phasestack setup` writes this
-    line.)
+    Only one panel at a time shows its card; the others are clear. Press Enter or n for the next panel, p for the
+    previous one, and q to quit. Configured panels are rotated, mirrored and registered as in a run. If no panels are
+    configured, each monitor shows the line that selects it in a configuration. (`phasestack setup` writes this line for
+    you.)
 
     Exits with 75 if the X server dies.
 
@@ -57,10 +57,10 @@ def identify(
 
 
 def _bound(settings: Settings) -> tuple[PanelSink, list[U8]]:
-    """Open the configured panels and return them with a test card for each panel.
+    """Open the configured panels, and return them with a test card for each.
 
     Raises:
-        InputError: The settings of a panel cannot be used.
+        InputError: A panel's settings cannot be used.
         PanelLost: A monitor or the X server is missing.
     """
     from runtime.clock import MonotonicClock
@@ -84,7 +84,7 @@ def _bound(settings: Settings) -> tuple[PanelSink, list[U8]]:
 
 
 def _hold(panels: PanelSink, cards: list[U8], poll: Callable[[], Key | None]) -> None:
-    """Show one card at a time until q is pressed. Closed windows and lost monitors are opened again."""
+    """Show one card at a time until q is pressed. Reopens closed windows and those on lost monitors."""
     import time
 
     from calib.keys import Key
@@ -92,7 +92,7 @@ def _hold(panels: PanelSink, cards: list[U8], poll: Callable[[], Key | None]) ->
     from runtime.panels.card import alone
     from runtime.records import PanelFrame
 
-    lost, number = "", 0  # frame number, incremented by each key press
+    lost, number = "", 0  # frame number, incremented at each key press
     shown, layers = 0, alone(cards, 0)
     typer.echo("press Enter or n for the next panel, p for the previous one, q to quit")
     try:

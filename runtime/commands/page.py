@@ -17,9 +17,9 @@ def page(
         Path | None, typer.Option(help="file with the login token, created if missing (default: in the state folder)")
     ] = None,
 ) -> None:
-    """Serve the operator's page, which shows and controls the running daemon.
+    """Serve the operator's page, used to watch and control the running daemon.
 
-    If no daemon is running, the page waits for one. Browsers log in with the token from the token file.
+    If no daemon is running, the page waits for one. Log in with the token in the token file.
 
     Example: phasestack page --port 8717
     """
@@ -31,10 +31,10 @@ def page(
     from runtime.support.background import BACKGROUND_NICENESS, set_niceness
     from runtime.support.folders import state_folder
 
-    set_niceness(BACKGROUND_NICENESS)  # before any thread starts, because the display has priority
+    set_niceness(BACKGROUND_NICENESS)  # before any thread is started, because the display has priority
     places = sockets(config)
     path = token_file or state_folder() / "page-token"
-    with retry_advised():  # for example when the disk is full
+    with retry_advised():  # for example if the disk is full
         token = token_of(path)
     served = listening("page", port)
     typer.echo(f"page: http://{LOOPBACK}:{served.getsockname()[1]}/ - the token is in {path}", err=True)

@@ -19,8 +19,8 @@ def plan(
 ) -> None:
     """List the work that the solver can skip for this scene, with reasons, time saved and quality lost.
 
-    The scene is drawn and solved about twenty times at full size. This takes seconds at 960x540, and minutes at 4K
-    without a GPU; --scale 0.25 makes it sixteen times as fast.
+    The scene is drawn and solved about twenty times at full size. This takes seconds at 960x540 but minutes at 4K
+    without a GPU. With --scale 0.25, it is sixteen times as fast.
 
     Example: phasestack plan --scene sparse
     """

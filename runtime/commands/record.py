@@ -1,4 +1,4 @@
-"""`phasestack record`: record the sensor's samples in a file that `--replay` can play."""
+"""`phasestack record`: record the sensor's samples in a file for `--replay` to play back."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from runtime.records import SensorFrame
     from runtime.sensor.worker import SensorWorker
 
-POLL_S = 0.004  # polling interval: a quarter of a 60 Hz sensor's period
-FIRST_SAMPLE_S = 15.0  # time limit for the first sample
+POLL_S = 0.004  # polling interval, a quarter of the period at 60 Hz
+FIRST_SAMPLE_S = 15.0  # how long to wait for the first sample
 SUFFIX = ".mcap"
 OVER = ("ended", "failed")
 
@@ -44,9 +44,9 @@ def record(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print the result as one JSON object")] = False,
 ) -> None:
-    """Record eye positions and their times and, with --images, pictures. Ctrl-C ends the recording.
+    """Record eye positions, when they were seen and, with --images, pictures. Press Ctrl-C to stop.
 
-    With --motion, the head is simulated as in the tracker's benchmark. The recording then contains noise, outliers,
+    With --motion, a head is simulated as in the tracker's benchmark. The recording then includes noise, outliers,
     dropouts and the true eyes.
 
     Example: phasestack record --out lean.mcap --seconds 20
@@ -78,9 +78,9 @@ def record(
 
 
 def _refuse_target(out: Path, *, motion: bool) -> None:
-    """Raise InputError if the file name has the wrong suffix, or the file exists or cannot be written.
+    """Raise InputError if a file name has the wrong suffix, or the file exists or cannot be written.
 
-    The recording of a simulated motion may be overwritten, because the seed reproduces that motion.
+    The recording of a simulated motion may be overwritten, because the same motion can be reproduced from its seed.
     """
     from runtime.sensor.recording import Recording
     from runtime.support.untrusted_input import checked_path
@@ -104,16 +104,16 @@ def _refuse_target(out: Path, *, motion: bool) -> None:
 
 
 def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | None) -> dict[str, Any]:
-    """Record until Ctrl-C, a time or size limit, or the end of the source, and return a summary.
+    """Record until Ctrl-C, a time or size limit, or the end of the source. Returns a summary.
 
     Args:
         out: File to write.
-        settings: Settings of the sensor and the eye finder.
-        images: Also record colour and depth pictures.
-        seconds: Length of the recording in seconds. None: ten minutes.
+        settings: Settings for the sensor and the eye finder.
+        images: True to record colour and depth pictures too.
+        seconds: How long to record, in seconds. None means ten minutes.
 
     Raises:
-        FatalError: The sensor cannot be used or delivers no sample.
+        FatalError: The sensor cannot be used or does not deliver any sample.
         InputError: The file cannot be written.
     """
     from runtime.clock import NS_PER_S, MonotonicClock
@@ -167,18 +167,18 @@ def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | N
 
 
 def _streams(frame: SensorFrame) -> list[str]:
-    """Return the kinds of data in a sample, such as `eyes` or `depth`."""
+    """List the kinds of data contained in a sample, such as `eyes` or `depth`."""
     parts = {"eyes": frame.eyes, "true eyes": frame.true_eyes_m, "colour": frame.colour, "depth": frame.depth_mm}
     return [name for name, value in parts.items() if value is not None]
 
 
 def _samples(worker: SensorWorker, limit_s: float) -> Iterator[SensorFrame]:
-    """Yield samples until the source ends, or for `limit_s` seconds after the first sample."""
+    """Yield samples until the source ends or until `limit_s` seconds after the first sample."""
     import time
 
     deadline_ns, begun = time.monotonic_ns() + round(FIRST_SAMPLE_S * 1e9), False
     while True:
-        is_over = worker.state in OVER  # read before `take`, because the last samples arrive before this state
+        is_over = worker.state in OVER  # check before `take`, because the last samples arrive before this state
         frames = worker.take()
         if frames and not begun:
             deadline_ns, begun = frames[0].capture_ns + round(limit_s * 1e9), True

@@ -18,10 +18,11 @@ def report(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
 ) -> None:
-    """Measure light PSNR and run time of every method on this machine and write them to a page.
+    """Measure every method's light PSNR and run time on this machine, and write a page with the results.
 
-    This takes minutes. The page appears with the first result and grows with each further one. Ctrl-C keeps the page.
-    To include the published network, convert its checkpoint with `phasestack export` and pass the result with --model.
+    This takes minutes. The page is written once the first result is in and is updated as each new result arrives.
+    Pressing Ctrl-C stops the run but keeps the page written so far. To include the published network, convert its
+    checkpoint with `phasestack export` and pass the converted file with --model.
 
     Example: phasestack report --pairs my-pairs --out report
     """

@@ -42,7 +42,7 @@ def run(
 ) -> None:
     """Run the display until SIGTERM. SIGHUP reloads the configuration.
 
-    Exits with 75 if the X server dies. A restarted service waits for the server to return.
+    Exits with 75 if the X server dies. When the service restarts, it waits for the X server to come back.
 
     Example: phasestack run --config /etc/phasestack/phasestack.toml
 

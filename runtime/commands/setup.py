@@ -20,8 +20,9 @@ def setup(
 ) -> None:
     """Set up a display: monitors, sizes, panel registration, grey curves and sensor calibration.
 
-    Answer in the terminal or press keys on the panels' windows. Every step can be skipped or repeated. After q, the
-    same command resumes where it stopped. The result is a valid configuration and a record of each step's figures.
+    Answer in the terminal, or press keys in the panels' windows. Every step can be skipped or repeated. If you quit
+    with q, run the same command again to continue where you stopped. The result is a valid configuration, and a record
+    of each step's figures.
 
     Example: phasestack setup --simulate --config try.toml --out try
     """

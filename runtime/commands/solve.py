@@ -45,7 +45,7 @@ def solve(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print the content of solve.json")] = False,
 ) -> None:
-    """Compute the layers for two still pictures and measure how well each eye sees its picture.
+    """Compute the layers for two still pictures, and measure how well each eye sees its picture.
 
     Example: phasestack solve --left l.png --right r.png --left-eye 0.6 -0.03 0 --right-eye 0.6 0.03 0 --fov 40
     --panels panels.json --out out/solve

@@ -33,17 +33,17 @@ from runtime.support.picture_file import read_image
 from runtime.support.progress import tell
 from runtime.support.ranges import SEPARATION_MIN_M
 
-MEASURED_FROM = 10  # with fewer runs, timing both backends takes longer than it saves
+MEASURED_FROM = 10  # with fewer runs, timing both backends would take longer than it saves
 
 
 @dataclass(frozen=True, slots=True)
 class Eyes:
-    """Eyes or cameras that took the pictures, as given by the options."""
+    """The eyes or cameras that took the pictures, as given by the options."""
 
-    left: tuple[float, ...] | None  # position in metres in the stack frame; None if `cameras` gives it
+    left: tuple[float, ...] | None  # position in metres in the stack frame; None if given by `cameras`
     right: tuple[float, ...] | None
-    fov_deg: float  # horizontal field of view of the pictures
-    cameras: Path | None  # file with the cameras' matrices
+    fov_deg: float  # the pictures' horizontal field of view
+    cameras: Path | None  # file that contains the cameras' matrices
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,16 +52,16 @@ class Files:
 
     left: Path
     right: Path | None
-    layout: str | None  # arrangement of the views in a single file
+    layout: str | None  # how the views are arranged if both are in one file
 
     @property
     def name(self) -> str:
         return self.left.name if self.right is None else f"{self.left.name} and {self.right.name}"
 
     def read(self) -> list[Any]:
-        """Read the pictures for the left and the right eye.
+        """Read the pictures for the left and right eyes.
 
-        Raises InputError if the pictures cannot be read or differ in size.
+        Raises InputError if a picture cannot be read or the two differ in size.
         """
         if self.right is None:
             return list(read_pair(self.left, with_options(Settings(), layout=self.layout).content))
@@ -86,9 +86,9 @@ def solve_pair(
     backend: str | None,
     plan: bool,
 ) -> dict[str, Any]:
-    """Solve a stereo pair, write the layers and pictures, and return the content of solve.json.
+    """Solve a stereo pair, write the layers and pictures, and return the contents of solve.json.
 
-    Raises InputError if a file, an option or the eye positions cannot be used.
+    Raises InputError if a file, an option or the given eye positions cannot be used.
     """
     watch = Stopwatch()
     settings = with_options(Settings(), model=model, backend=backend).model
@@ -108,14 +108,14 @@ def solve_pair(
 
         predictor = load_predictor(model, stack, settings)
         cleanup.callback(predictor.close)
-        # A few solutions take less time than timing both backends.
+        # A few solutions take less time than it would take to time both backends.
         device = "cpu" if settings.backend == "auto" and repeat < MEASURED_FROM else settings.backend
         predictor.set_backend(choose(device, predictor, context).backend)
         watch.lap("load model")
         inference_ms: list[float] = []
 
         def solve() -> Prediction:
-            tell("solving", len(inference_ms), repeat + 1)  # the first run warms up
+            tell("solving", len(inference_ms), repeat + 1)  # the first run is the warm-up
             left, right = pictures
             prediction = solve_still(
                 left,
@@ -131,7 +131,7 @@ def solve_pair(
 
         try:
             done = timed(solve, runs=repeat)
-        except EyesNotServed as error:  # a lasting failure, because the eyes of a still pair do not move
+        except EyesNotServed as error:  # permanent, because the eyes of a still pair do not move
             why = f"{error}: {predictor.name} does not support these eye positions; try --model sart"
             raise InputError("solve", "--left-eye, --right-eye", why) from None
         watch.lap("solve, warm-up included")
@@ -159,7 +159,7 @@ def solve_pair(
                 "provider": predictor.provider,
                 "backend": predictor.backend,
                 "eye_sigma_mm": eye_sigma_mm,
-                "steps": done.answer.steps + 1,  # the network's initial layers count as a step
+                "steps": done.answer.steps + 1,  # the network's initial layers count as one
                 "plan": [asdict(item) for item in items],
                 "notes": notes,
                 "wall_s": {part: round(ms / 1e3, 3) for part, ms in watch.stage_ms.items()},
@@ -170,20 +170,21 @@ def solve_pair(
 
 
 def taken(pictures: list[Any], eyes: Eyes, stack: PanelStack) -> tuple[list[Any], F64, float]:
-    """Return the pictures as taken by eyes that look at the stack's origin.
+    """Return the pictures as if taken by eyes that look at the stack's origin.
 
-    Pictures from other cameras (--camera) are resampled.
+    Pictures taken by other cameras (--camera) are resampled.
 
     Args:
-        pictures: Pictures for the left and the right eye.
-        eyes: Eyes or cameras that took the pictures.
+        pictures: Pictures for the left and right eyes.
+        eyes: The eyes or cameras that took the pictures.
         stack: Panels to solve for.
 
     Returns:
-        The pictures, the eyes (2, 3) in metres in the stack frame, and the horizontal field of view in degrees.
+        The pictures, the eyes (2, 3) in metres in the stack frame, and the pictures' horizontal field of view in
+        degrees.
 
     Raises:
-        InputError: The eyes or cameras are missing, given twice or invalid.
+        InputError: The eyes or cameras are missing, invalid or given twice.
     """
     if eyes.cameras is None:
         if eyes.left is None or eyes.right is None:
@@ -202,9 +203,9 @@ def taken(pictures: list[Any], eyes: Eyes, stack: PanelStack) -> tuple[list[Any]
 
 
 def checked_eyes(left_eye: tuple[float, ...], right_eye: tuple[float, ...], stack: PanelStack) -> F64:
-    """Return the eyes as an array (2, 3), in metres in the stack frame.
+    """Return the eyes as a (2, 3) array, in metres in the stack frame.
 
-    Raises InputError if an eye is not in front of the panels or if the eyes are too close to each other.
+    Raises InputError if either eye is not in front of the panels or if the two are too close together.
     """
     for option, eye in (("--left-eye", left_eye), ("--right-eye", right_eye)):
         if eye[0] <= max(stack.x_m):

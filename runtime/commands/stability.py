@@ -20,9 +20,9 @@ def stability(
         Path | None, typer.Option(help="record the errors as new limits in this file, after a model has changed")
     ] = None,
 ) -> None:
-    """Run every numerical method on stiff and extreme cases, and compare the results with references.
+    """Run every numerical method on stiff and extreme cases and compare the results with references.
 
-    The error of a case without a reference may exceed its recorded limit by 5%. Exits with 1 if a case fails.
+    If a case has no reference, its error may exceed the recorded limit by up to 5%. Exits with 1 if any case fails.
 
     Example: phasestack stability --out stability
     """
@@ -62,7 +62,7 @@ def stability(
 
 
 def _fits() -> dict[str, Fit]:
-    """Return a function for each calibration method, which fits a 4x4 matrix to pairs of points."""
+    """Return, for each calibration method, a function that fits a 4x4 matrix to pairs of points."""
     from functools import partial
 
     from calib.solution import METHODS, Method, solve

@@ -25,7 +25,7 @@ def try_(
     seconds: Annotated[float | None, number(1, 1e6, "s", help="stop after this many seconds")] = None,
     as_json: Annotated[bool, typer.Option("--json", help='print {"url": ...} as soon as the page is served')] = False,
 ) -> None:
-    """Try the display without hardware. A browser shows what a viewer would see.
+    """Try the display without hardware. Your browser shows what a viewer would see.
 
     Example: phasestack try
     """

@@ -1,4 +1,4 @@
-"""Implementation of `phasestack try`: the daemon with a web page in place of its sensor and panels."""
+"""Implementation of `phasestack try`, which runs the daemon with a web page as sensor and panels."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ from runtime.daemon.supervise import run_daemon
 from runtime.page.connections import LOOPBACK, listening, server_of
 from runtime.page.server import application
 
-SIZE_PX = {"width_px": 960, "height_px": 540}  # small by default, because small panels are solved more often per second
-SCENE = "room"  # scene to show without a configuration file
-WEBCAM_FOV_DEG = 65.0  # typical for webcams; a configuration file can set another value
-SLOW_PAGE_S = 2.0  # time without a picture after which the page's camera counts as lost
-MEASURED_EVERY_S = 4.0  # interval between measurements of the light at the eyes
+SIZE_PX = {"width_px": 960, "height_px": 540}  # small by default, because small panels get more solutions per second
+SCENE = "room"  # scene shown if there is no configuration file
+WEBCAM_FOV_DEG = 65.0  # typical of webcams; can be changed in a configuration file
+SLOW_PAGE_S = 2.0  # the page's camera counts as lost if no picture arrives for this long
+MEASURED_EVERY_S = 4.0  # interval for measuring the light at the eyes
 
 
 def settings_of(
     config: Path | None, *, scene: str | None, layout: str | None, model: str | None, webcam: bool
 ) -> Settings:
-    """Return the settings for `phasestack try`. Raises InputError if a setting or an option is invalid."""
+    """Return the settings for `phasestack try`. Raises InputError if a setting or option is invalid."""
     settings = load_settings(config) if config else changed(Settings(), "stack", SIZE_PX, source="try")
     settings = with_options(settings, scene=scene or (None if config else SCENE), layout=layout, model=model)
     if settings.sensor.driver != "usb-camera" or not webcam:
@@ -49,17 +49,17 @@ def settings_of(
 
 
 def try_display(settings: Settings, *, port: int, opens: bool, seconds: float | None, as_json: bool) -> None:
-    """Serve the page and run the daemon until the daemon is stopped.
+    """Serve the page and run the daemon until it is stopped.
 
     Args:
-        settings: Settings from `settings_of`.
-        port: Port to listen on. 0 picks a free port.
-        opens: Open the page in a browser if there is a graphical session.
-        seconds: Time limit in seconds. None: no limit.
-        as_json: Print the address of the page as a JSON object.
+        settings: Settings, from `settings_of`.
+        port: Port to listen on. 0 picks a free one.
+        opens: True to open the page in a browser if there is a graphical session.
+        seconds: Time limit in seconds, or None for no limit.
+        as_json: True to print the page's address as a JSON object.
 
     Raises:
-        InputError: The port is in use, or the settings cannot be used.
+        InputError: The port is already in use, or the settings cannot be used.
     """
     is_sensor = settings.sensor.driver == "browser"
     link = BrowserLink(settings.stack.stack(), settings.content.fov_deg, is_sensor=is_sensor)
@@ -90,9 +90,9 @@ def _as_it_is(settings: Settings) -> Settings:
 
 
 def _as_wished(settings: Settings, link: BrowserLink) -> Settings:
-    """Return the settings with the gap chosen on the page and the current scene and model.
+    """Return the settings with the gap chosen on the page, and with the current scene and model.
 
-    If the page has switched the camera on or off, the link is updated as well.
+    If the camera has been switched on or off on the page, the link is also updated.
     """
     wishes, link.wishes = link.wishes, {}
     account = link.shown[1]
@@ -109,7 +109,7 @@ def _as_wished(settings: Settings, link: BrowserLink) -> Settings:
 
 @contextmanager
 def _served(link: BrowserLink, socket: Path, port: int) -> Iterator[str]:
-    """Serve the page in a thread and yield the address of the page, including the token."""
+    """Serve the page on a thread and yield its address, including the token."""
     token, served = secrets.token_urlsafe(32), listening("try", port)
     server = server_of(application(DaemonClient((socket,)), token, link=link))
     sockets: dict[str, Any] = {"sockets": [served]}

@@ -1,4 +1,4 @@
-"""Validated, immutable settings from TOML files. `settings.py` contains defaults and descriptions."""
+"""Validated, immutable settings, read from TOML files. `settings.py` holds defaults and descriptions."""
 
 from runtime.config.files import changed, load_settings, load_stack, with_options
 from runtime.config.settings import (

@@ -1,4 +1,4 @@
-"""Load settings files and panels files, and override settings with options or operators' choices."""
+"""Load settings files and panels files, and override settings from the command line or by operators."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from runtime.support.sections import Section, read_table, validated
 
 
 def load_settings(path: Path | None) -> Settings:
-    """Read the settings from a file, or return the defaults if `path` is None.
+    """Read settings from a file, or return the defaults if `path` is None.
 
     Raises InputError if the file cannot be read or contains an invalid setting.
     """
@@ -22,15 +22,15 @@ def load_settings(path: Path | None) -> Settings:
 
 
 def load_stack(path: Path, *, width_px: int, height_px: int) -> PanelStack:
-    """Read the geometry of the stack from a file for `--panels`.
+    """Read the stack's geometry from a file given with `--panels`.
 
     Args:
         path: TOML or JSON file.
-        width_px: Width of the panels in pixels, used if the file does not contain a width.
-        height_px: Height of the panels in pixels, used if the file does not contain a height.
+        width_px: The panels' width in pixels, used if the file does not give one.
+        height_px: The panels' height in pixels, used if the file does not give one.
 
     Raises:
-        InputError: The file cannot be read, lacks a field or contains an invalid value.
+        InputError: The file cannot be read, a field is missing or a value is invalid.
     """
     table = {"width_px": width_px, "height_px": height_px} | read_table(path)
     for name in ("width_m", "height_m", "x_m"):
@@ -55,8 +55,8 @@ def with_options(
 ) -> Settings:
     """Return the settings with command-line options applied.
 
-    An option that is None or False changes nothing. `loop` makes the recording restart when it ends. Raises InputError,
-    which names the option, if a value is invalid.
+    Any option that is None or False changes nothing. With `loop`, the recording starts again when it ends. If a value
+    is invalid, raises InputError with the option's name.
     """
     overrides: tuple[tuple[str, str, dict[str, Any] | None], ...] = (
         ("--replay", "sensor", None if replay is None else {"driver": "replay", "source": replay}),
@@ -74,9 +74,9 @@ def with_options(
 
 
 def changed(settings: Settings, section: str, values: dict[str, Any], *, source: str) -> Settings:
-    """Return the settings with some values of one section replaced.
+    """Return the settings with some values in one section replaced.
 
-    Raises InputError, which names `source`, if a value is invalid.
+    If a value is invalid, raises InputError with `source` as its origin.
     """
     old: Section = getattr(settings, section)
     new = validated(type(old), old.model_dump() | values, source=source)

@@ -1,6 +1,6 @@
-"""Types for settings that contain a path, which is relative to the folder of the configuration file.
+"""Types for settings that contain a path relative to the configuration file's folder.
 
-Paths from code or the command line are not changed.
+A path given in code or on the command line is used unchanged.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from runtime.support.plugins import located
 
 
 def path_in(folder: Path | None, value: str, *, or_name: bool = False) -> str:
-    """Return a path resolved against the folder of the configuration file.
+    """Return a path resolved against the configuration file's folder.
 
     Args:
-        folder: Folder of the configuration file. None: return the value unchanged.
-        value: Path.
-        or_name: Return a single word without a suffix unchanged, because such a word is a name.
+        folder: The configuration file's folder. None returns the value unchanged.
+        value: The path.
+        or_name: True to return a single word without a suffix unchanged, because it is then a name.
     """
     if folder is None or Path(value).name in ("", ".."):
         return value
@@ -27,5 +27,5 @@ def path_in(folder: Path | None, value: str, *, or_name: bool = False) -> str:
 
 
 PathText = Annotated[str, AfterValidator(lambda value, info: path_in(info.context, value))]
-# For example, `demo` is a name, and `demo.glb` is a path.
+# For example, `demo` is a name but `demo.glb` is a path.
 NameOrPath = Annotated[str, AfterValidator(lambda value, info: path_in(info.context, value, or_name=True))]

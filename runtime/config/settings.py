@@ -1,7 +1,7 @@
-"""Definitions of all settings, with types, ranges, defaults and descriptions.
+"""All settings, with their types, ranges, defaults and descriptions.
 
-The ranges allow every display that can be built. They exclude values in a wrong unit, for which the error message
-suggests the right one.
+The ranges allow for any display that can be built, but rule out values given in the wrong unit. In that case, the error
+message suggests the right unit.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ from runtime.support.plausible import nearest, within
 from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG
 from runtime.support.sections import Section
 
-MOST = 1e9  # limit for numbers without a narrower range
-PIXEL_ASPECT_TOLERANCE = 0.03  # relative, because data sheets round the size of the active area
-LEAST_GAP_M = 1e-5  # minimum distance between panels; any real panel is thicker
-PANELS_MOST = 8  # largest number of panels in a stack
+MOST = 1e9  # limit for numbers that have no narrower range
+PIXEL_ASPECT_TOLERANCE = 0.03  # relative; data sheets give a rounded size for the active area
+LEAST_GAP_M = 1e-5  # minimum distance between panels; real panels are all thicker
+PANELS_MOST = 8  # maximum number of panels in a stack
 
 NonNegative = Annotated[float, Field(ge=0, le=MOST)]
 Unit = Annotated[float, Field(ge=0, le=1)]
-Entry = Annotated[float, Field(ge=-MOST, le=MOST)]  # element of a matrix
-Slope = Annotated[float, Field(ge=-0.2, le=0.2)]  # slope of a panel that is meant to be upright
-Coordinate = Annotated[float, within(-EYE_MOST_M, EYE_MOST_M, "m")]  # coordinate of an eye
+Entry = Annotated[float, Field(ge=-MOST, le=MOST)]  # matrix element
+Slope = Annotated[float, Field(ge=-0.2, le=0.2)]  # slope of a panel meant to be upright
+Coordinate = Annotated[float, within(-EYE_MOST_M, EYE_MOST_M, "m")]  # eye coordinate
 Point = tuple[Coordinate, Coordinate, Coordinate]
-Offset = Annotated[float, within(-10.0, 10.0, "m")]  # displacement of a scene
-Turn = Annotated[float, within(-360.0, 360.0, "degrees")]  # rotation of a scene
+Offset = Annotated[float, within(-10.0, 10.0, "m")]  # scene displacement
+Turn = Annotated[float, within(-360.0, 360.0, "degrees")]  # scene rotation
 
 
 class StackGeometry(Section):
-    """Geometry of the stack, from `--panels FILE` or the `[stack]` table of a configuration."""
+    """The stack's geometry, from `--panels FILE` or a configuration's `[stack]` table."""
 
     width_m: Annotated[float, within(0.005, 20.0, "m")] = Field(
         0.5184, description="width of every panel's active area in metres"
@@ -77,7 +77,7 @@ class StackGeometry(Section):
         return self
 
     def check_pixels(self) -> None:
-        """Raise ValueError if the sizes in metres and in pixels contradict `pixel_aspect`."""
+        """Raise ValueError if the sizes in metres and pixels do not agree with `pixel_aspect`."""
         aspect = (self.width_m / self.width_px) / (self.height_m / self.height_px)
         if abs(aspect / self.pixel_aspect - 1) > PIXEL_ASPECT_TOLERANCE:
             square_m = self.width_m / self.width_px * self.height_px / self.pixel_aspect
@@ -122,7 +122,7 @@ class SensorSettings(Section):
     @field_validator("source")
     @classmethod
     def _resolve_source(cls, source: str, info: ValidationInfo) -> str:
-        # Other drivers take serial numbers and URIs, which may contain slashes.
+        # With other drivers, the source is a serial number or URI, which may contain slashes.
         if info.data.get("driver") == "replay" or source.endswith((".oni", ".bag", ".db3")):
             return path_in(info.context, source, or_name=source == "demo")
         return source
@@ -141,7 +141,7 @@ class TrackerSettings(Section):
 
 
 class CalibrationSettings(Section):
-    """Calibration from the sensor frame to the stack frame, and the viewing range."""
+    """Calibration that maps the sensor frame to the stack frame, and the viewing range."""
 
     file: PathText = Field("", description="calibration file (TOML); empty: the demo recording's")
     ipd_m: Annotated[float, within(0.04, 0.08, "m", zero=True)] = Field(
@@ -234,12 +234,12 @@ class ContentSettings(Section):
 
 
 def _accept_legacy_backend(name: Any) -> Any:
-    """Return the current name of a backend. Old scripts use `opencv` for `cpu`."""
+    """Return a backend's current name. Old scripts use `opencv` for `cpu`."""
     return "cpu" if name == "opencv" else name
 
 
 class ModelSettings(Section):
-    """The model and the device on which it runs."""
+    """The model, and the device to run it on."""
 
     name: NameOrPath = Field("balanced", description="fast, balanced, best, sart, or an ONNX file with our contract")
     effort: Literal["auto", "full"] = Field(
@@ -335,7 +335,7 @@ class LoopSettings(Section):
 
 
 class PlanSettings(Section):
-    """Savings that the solver and the display loop may use."""
+    """Ways for the solver and the display loop to save work."""
 
     enabled: bool = Field(
         True,
@@ -345,7 +345,7 @@ class PlanSettings(Section):
 
 
 class ServiceSettings(Section):
-    """The socket and the black box of the daemon."""
+    """The daemon's socket and black box."""
 
     socket: PathText = Field("/run/phasestack/status.sock", description="path of the status and control socket")
     blackbox_minutes: Annotated[float, within(0.0, 60.0, "min")] = Field(

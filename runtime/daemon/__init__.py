@@ -1,1 +1,1 @@
-"""The daemon, which builds, supervises and reconfigures a run and answers on a local socket."""
+"""The daemon: builds, supervises and reconfigures a run, and answers requests on a local socket."""

@@ -1,4 +1,4 @@
-"""Composition root, which creates all parts of a run from the settings."""
+"""Create all of a run's parts from the settings (composition root)."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ from runtime.support.untrusted_input import LIMITS
 
 log = logging.getLogger("phasestack.build")
 
-SWITCH_INTERVAL_S = 0.0005  # Python's thread switch interval; a short one lets the presenter resume quickly
+SWITCH_INTERVAL_S = 0.0005  # Python's thread switch interval, short so that the presenter can resume quickly
 
-# Figures in summary.json that follow from the configuration if the clock is simulated.
+# Figures in summary.json that are determined by the configuration if the clock is simulated.
 SIMULATED_FIGURES = (
     "seconds", "fps", "solutions_per_s", "interval_ms", "photon_ms", "stage_ms", "overhead_ms", "skew_ms",
     "solution_age_ms", "efforts",
@@ -55,22 +55,22 @@ SIMULATED_FIGURES = (
 
 @dataclass(frozen=True, slots=True)
 class RunOptions:
-    """Options of a run that are set only on the command line."""
+    """A run's options that can be set only on the command line."""
 
-    max_speed: bool = False  # play a recording on a simulated clock, without waiting
-    measure: bool = False  # measure the quality of some refreshes
+    max_speed: bool = False  # play a recording without waiting, against a simulated clock
+    measure: bool = False  # measure the quality of a sample of refreshes
     scale: float = 1.0  # factor applied to the panels' size in pixels
-    keep_light: int = 0  # write the layers of every N-th refresh; 0: never
+    keep_light: int = 0  # N: write every N-th refresh's layers; 0: write none
     frames: int | None = None  # stop after this many refreshes; None: run to the end
-    out: Path | None = None  # folder for the files of the run
-    browser: BrowserLink | None = None  # link to the page that shows the panels and may act as the sensor
+    out: Path | None = None  # folder for the run's files
+    browser: BrowserLink | None = None  # link to a page that shows the panels and may serve as the sensor
     until: Callable[[], str] = str  # returns the reason to stop, or "" to continue
-    fixed: Effort | None = None  # effort of every solution if model.effort is "full"; None: all steps of the model
+    fixed: Effort | None = None  # effort of every solution if model.effort is "full"; None: all of the model's steps
 
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """A run as built by `build_run`, with access to its solver, savings and summary."""
+    """A run built by `build_run`, with access to its solver, savings and summary."""
 
     presenter: Presenter
     observer: RunObserver
@@ -79,18 +79,18 @@ class Run:
 
     @property
     def parts(self) -> RunningSolver:
-        """Newest solver, with its OpenGL context and backend."""
+        """The latest solver, with its OpenGL context and backend."""
         assert self.maker.parts is not None
         return self.maker.parts
 
     def plan_items(self) -> list[dict[str, Any]]:
-        """Return the savings in use as dictionaries. Times and costs that were not measured are None."""
+        """Return the savings in use as dictionaries. Any time or cost that was not measured is None."""
         solver = self.parts.solver
         known = replace(solver.measured, reuse=Saving(saves_ms=self.presenter.stats.reuse_saves_ms()))
         return [asdict(item) for item in solver.plan_items(known)]
 
     def summary(self) -> dict[str, Any]:
-        """Return the content of summary.json (docs/contracts.md)."""
+        """Return the contents of summary.json (docs/contracts.md)."""
         return {
             "clock": "simulated" if self.simulated else "real",
             "configured": list(SIMULATED_FIGURES) if self.simulated else [],  # figures that were not measured
@@ -103,7 +103,7 @@ class Run:
 
 
 def scaled_stack(settings: Settings, scale: float) -> PanelStack:
-    """Return the configured stack with its width and height in pixels scaled by `scale`."""
+    """Return the configured stack, with its width and height in pixels multiplied by `scale`."""
     stack = settings.stack.stack()
     if scale == 1.0:
         return stack
@@ -113,27 +113,27 @@ def scaled_stack(settings: Settings, scale: float) -> PanelStack:
 
 
 class Host(Supervisor):
-    """Callbacks for the start of a run, in addition to those of `Supervisor`. The defaults do nothing."""
+    """Callbacks used while a run starts, in addition to those in `Supervisor`. The defaults do nothing."""
 
-    recorder: Any = None  # additional observer, whose `watches` is called before the first refresh
+    recorder: Any = None  # additional observer; its `watches` is called before the first refresh
 
     def starting(self, doing: str) -> bool:
-        """Called before each long step of the start, and repeatedly while content and model load.
+        """Called before each long startup step, and repeatedly while content and model load.
 
         Args:
-            doing: Description of the step, such as "opening panels".
+            doing: What is being done, such as "opening panels".
 
         Returns:
-            False to cancel the start. This takes effect only while content and model load.
+            False to cancel startup, which takes effect only while content and model load.
         """
         return True
 
     def wait_for_panel(self, why: str) -> bool:
-        """Called when a panel is missing. Returns True, after a pause, to try again, or False to give up."""
+        """Called when a panel is missing. Returns True after a pause to try again, or False to give up."""
         return False
 
     def watches(self, run: Run) -> None:
-        """Called with the complete run before its first refresh."""
+        """Called with the complete run before the first refresh."""
 
 
 def build_run(
@@ -148,17 +148,17 @@ def build_run(
     """Build a run that is ready for its first refresh.
 
     Args:
-        settings: Settings of the run.
-        options: Options that are set only on the command line.
-        cleanup: Stack that closes all parts of the run when it is closed.
-        host: Callbacks for the start and, as the presenter's supervisor, for each refresh. None: no callbacks.
-        output: Destination of the run's files. None: write no files.
-        on_account: Function that is called with the account of each refresh.
+        settings: The run's settings.
+        options: Options that can be set only on the command line.
+        cleanup: Stack that, when closed, closes all of the run's parts.
+        host: Callbacks used during startup and, as the presenter's supervisor, at each refresh. None for no callbacks.
+        output: Destination for the run's files. If None, no files are written.
+        on_account: Function called with each refresh's account.
 
     Raises:
         FatalError: A setting or a file cannot be used.
-        PanelLost: A panel is missing, and the host does not wait for it.
-        Stopped: The host has cancelled the start.
+        PanelLost: A panel is missing and the host does not wait for it.
+        Stopped: The host has cancelled startup.
     """
     host = host or Host()
     if options.scale != 1.0 and settings.output.kind != "offscreen":
@@ -248,11 +248,11 @@ def build_run(
     if host.recorder is not None:
         host.recorder.watches(presenter, in_stack_frame=in_stack_frame)
     if not simulated:
-        # Exclude the libraries' objects from garbage collection, which would stop every thread for several refreshes.
+        # Keep the libraries' objects out of garbage collection, which would stop all threads for several refreshes.
         gc.collect()
         gc.freeze()
         cleanup.callback(gc.unfreeze)
-        cleanup.enter_context(before_all_others())  # applies to this thread only; all others have already started
+        cleanup.enter_context(before_all_others())  # affects only this thread, because all others have already started
     run = Run(presenter, observer, maker, simulated)
     host.watches(run)
     return run

@@ -1,4 +1,4 @@
-"""Changes that operators make to a run's settings, which are loaded one at a time."""
+"""Apply operators' changes to a run's settings, one at a time."""
 
 from __future__ import annotations
 
@@ -28,37 +28,37 @@ NEEDS_RESTART = (
     "loop",
     "model.backend",
     "calibration.ipd_m",
-)  # settings that are read only when a run starts
+)  # settings read only when a run starts
 
 
 @dataclass(frozen=True, slots=True)
 class Choices:
-    """Configuration as last read, together with the settings that the operator has overridden."""
+    """The configuration as last read, and the settings overridden by the operator."""
 
     configured: Settings
-    chosen: dict[tuple[str, str], Any] = field(default_factory=dict)  # chosen value by (section, key)
+    chosen: dict[tuple[str, str], Any] = field(default_factory=dict)  # chosen values, keyed by (section, key)
 
     def settings(self) -> Settings:
-        """Return the settings with all choices applied. Raises InputError if the result is invalid."""
+        """Return the settings with all choices applied. Raises InputError if they are invalid."""
         settings = self.configured
         for (section, key), value in self.chosen.items():
             settings = changed(settings, section, {key: value}, source="ctl")
         return settings
 
     def choosing(self, section: str, **values: Any) -> Choices:
-        """Return a copy that also overrides the given settings of one section."""
+        """Return a copy that also overrides these settings in one section."""
         return replace(self, chosen=self.chosen | {(section, key): value for key, value in values.items()})
 
     def another_scene(self, scene: str) -> Choices:
-        """Return a copy with another scene, which starts in its configured placement."""
+        """Return a copy with another scene, placed as configured."""
         kept = {setting: value for setting, value in self.chosen.items() if setting[1] not in PLACING}
         return replace(self, chosen=kept).choosing("content", scene=scene)
 
     def reloaded(self, read: Callable[[], Settings]) -> Choices:
-        """Return a copy with the configuration that `read` returns.
+        """Return a copy with the configuration returned by `read`.
 
-        A choice is kept only if the new configuration does not change that setting. Raises InputError if the new
-        configuration is invalid or changes a setting that requires a restart.
+        A choice is kept only if the setting is the same in the new configuration as in the old one. Raises InputError
+        if the new configuration is invalid or if it changes a setting that requires a restart.
         """
         settings, before = read(), self.configured
         frozen = [name for name in NEEDS_RESTART if attrgetter(name)(settings) != attrgetter(name)(before)]
@@ -74,15 +74,15 @@ def _value(settings: Settings, at: tuple[str, str]) -> Any:
 
 @dataclass(slots=True)
 class _Change:
-    """A change of settings that a command requests."""
+    """A change of settings requested by a command."""
 
     command: Command
-    choose: Callable[[Choices], Choices]  # computes the new choices on the loading thread; may raise InputError
+    choose: Callable[[Choices], Choices]  # returns the new choices; called on the loading thread; may raise InputError
     reload_content: bool = False
-    choices: Choices | None = None  # set by the loading thread before its job ends
+    choices: Choices | None = None  # set by the loading thread before it is done
 
     def settings(self, before: Choices) -> Settings:
-        """Apply the change to the choices made before, and return the new settings.
+        """Apply the change to the previous choices, and return the new settings.
 
         Raises InputError if the new settings are invalid.
         """
@@ -91,30 +91,30 @@ class _Change:
 
 
 class Changes:
-    """Manager of operators' changes to a run, which loads one change at a time.
+    """Carries out operators' changes to a run, loading one change at a time.
 
-    Only the presenter's thread uses this object. A background job reads the settings and loads new parts (see
-    `Reconfiguration`), and the solver's thread moves the scene. Both work on copies of their inputs. `carry_on` polls
-    the job and collects the outcomes of the solver's work, and never waits.
+    For use only on the presenter's thread. Settings are read and new parts loaded by a background job (see
+    `Reconfiguration`), and the scene is moved on the solver's thread. Both work on copies of their inputs. `carry_on`
+    polls the job and collects the results from the solver's thread. It never waits.
     """
 
     def __init__(self, presenter: Presenter) -> None:
         self._presenter = presenter
         self.choices = Choices(presenter.run_cell.state.settings)
-        self.refused = ""  # reason for refusing the last change; empty if it was accepted
+        self.refused = ""  # why the latest change was refused; empty if it was accepted
         self._loading: tuple[_Change, Reconfiguration] | None = None
-        self._next: _Change | None = None  # starts when the current change has ended
-        self._outcomes: SimpleQueue[Callable[[], None]] = SimpleQueue()  # outcomes of work on the solver's thread
+        self._next: _Change | None = None  # to start once the current change is over
+        self._outcomes: SimpleQueue[Callable[[], None]] = SimpleQueue()  # results from the solver's thread
 
     @property
     def loading(self) -> Reconfiguration | None:
-        """Return the change that is being loaded, or None."""
+        """The change being loaded, or None."""
         return None if self._loading is None else self._loading[1]
 
     def carry_on(self) -> None:
-        """Process the results of other threads and start a waiting change. Called once per refresh."""
+        """Process results from other threads and start the next waiting change. Called once per refresh."""
         finished = self._loading is not None and self._loading[1].finished
-        while not self._outcomes.empty():  # first, because an outcome may concern the scene that the change replaces
+        while not self._outcomes.empty():  # first, because they may concern the scene to be replaced
             self._outcomes.get()()
         if self._loading is not None and finished:
             (change, loading), self._loading = self._loading, None
@@ -125,12 +125,12 @@ class Changes:
             self.attempt(change.command, partial(self._load, change))
 
     def begin(self, command: Command, choose: Callable[[Choices], Choices], *, reload_content: bool = False) -> None:
-        """Start a change, or replace the change that is still loading.
+        """Start a change, or replace one that is still loading.
 
         Args:
-            command: Command to answer when the change has ended.
-            choose: Function that computes the new choices from the current ones, on the loading thread.
-            reload_content: Reload the content even if the content settings have not changed.
+            command: Command to answer once the change is over.
+            choose: Function that returns the new choices, given the current ones. Called on the loading thread.
+            reload_content: True to reload the content even if its settings have not changed.
         """
         change = _Change(command, choose, reload_content)
         if self._loading is None:
@@ -144,9 +144,9 @@ class Changes:
         self._next = change
 
     def place(self, command: Command) -> None:
-        """Move the scene as the command asks. Raises InputError if the placement is invalid.
+        """Move the scene as requested. Raises InputError if the placement is invalid.
 
-        The solver's thread replaces the settings and the content together, between two solutions.
+        The settings and the content are replaced together, on the solver's thread between two solutions.
         """
         values = command.value or status.placing_in(self.choices.configured)
         changed(self._presenter.run_cell.state.settings, "content", values, source="place")
@@ -164,7 +164,7 @@ class Changes:
         self._between_steps(command, move, moved)
 
     def skip(self, command: Command) -> None:
-        """Advance the playlist to its next entry. The solver's thread does this between two solutions."""
+        """Advance the playlist to its next entry, on the solver's thread between two solutions."""
 
         def skip(parts: Any) -> str:
             skipped = parts.run.state.content.skip(time_ns=self._presenter.clock.now_ns())
@@ -173,16 +173,16 @@ class Changes:
         self._between_steps(command, skip)
 
     def attempt(self, command: Command, work: Callable[[], None]) -> None:
-        """Run `work`. If an exception is raised, refuse the command and let the run continue."""
+        """Run `work`. If it raises an exception, refuse the command and let the run continue."""
         if problem := _problem_of(command, work):
             self.answer(command, problem)
 
     def answer(self, command: Command, problem: str) -> None:
-        """Report the outcome of a command to its client and in the status. Refusals are also logged.
+        """Report a command's outcome to its client and in the status. If it was refused, also log this.
 
         Args:
             command: Command to answer.
-            problem: Reason for a refusal, or an empty string if the command succeeded.
+            problem: Why the command was refused, or an empty string if it succeeded.
         """
         self.refused = problem
         if problem:
@@ -199,10 +199,10 @@ class Changes:
         self._presenter.solver.do(loading.advance)
 
     def _finish(self, change: _Change, loading: Reconfiguration) -> None:
-        """Answer the command of a finished change. If the change took effect, adopt its choices."""
+        """Answer a finished change's command. If the change has taken effect, adopt its choices."""
         if not loading.problem and change.choices is not None:
             state = self._presenter.run_cell.state
-            moved = moved_since(loading.settings.content, state.settings.content)  # placed during loading
+            moved = moved_since(loading.settings.content, state.settings.content)  # moved during loading
             self.choices = change.choices.choosing("content", **moved)
             log.info("changed: scene %s, model %s", state.content.info.name, state.predictor.name)
         self.answer(change.command, loading.problem)
@@ -210,12 +210,12 @@ class Changes:
     def _between_steps(
         self, command: Command, work: Callable[[Any], str], succeeded: Callable[[], None] = lambda: None
     ) -> None:
-        """Run `work` on the solver's thread between two solutions, then answer the command on this thread.
+        """Run `work` on the solver's thread between two solutions. Then answer the command on this thread.
 
         Args:
             command: Command to answer.
-            work: Function of the solver's parts that returns the reason for a refusal, or an empty string.
-            succeeded: Function that the presenter's thread calls after a success, before the answer.
+            work: Function called with the solver's parts. Returns why the command was refused, or an empty string.
+            succeeded: Function called on the presenter's thread if the work succeeds, before the command is answered.
         """
 
         def finish(problem: str) -> None:
@@ -233,7 +233,7 @@ class Changes:
 
 
 def _problem_of(command: Command, work: Callable[[], None]) -> str:
-    """Run `work` and return an error message, or an empty string on success. Logs unexpected errors."""
+    """Run `work` and return an error message, or an empty string if it succeeds. Logs unexpected errors."""
     try:
         work()
     except PhasestackError as error:

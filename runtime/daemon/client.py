@@ -1,4 +1,4 @@
-"""Client of the running daemon, which finds the socket, sends one JSON line and reads the answer."""
+"""Find the running daemon's socket, send a request as one JSON line and read the answer."""
 
 from __future__ import annotations
 
@@ -15,59 +15,59 @@ from typing import Any
 
 from runtime.errors import TransientError
 
-# Copy of `ServiceSettings().socket` that is available without loading the settings.
+# Same as `ServiceSettings().socket`, but available without loading the settings.
 DEFAULT_SOCKET = "/run/phasestack/status.sock"
 UNIT = "phasestack"
-REQUEST_MAX_BYTES = 65536  # maximum length of a request, which bounds the memory that a client can occupy
-REQUEST_S = 5.0  # time limit for receiving a request, and for sending its answer
-# Seconds for which the answer to each request is cached.
+REQUEST_MAX_BYTES = 65536  # maximum length of a request, which limits how much memory a client can use up
+REQUEST_S = 5.0  # time limit for receiving a request and for sending the answer
+# How long the answer to each request is cached, in seconds.
 LOOKED_UP_AGAIN_S = {"status": 0.2, "pictures": 0.3, "log": 0.5, "about": 2.0}
-LOOKED_UP_WITHIN_S = 3.0  # time limit for answers that do not involve the loop, after which the page reports a hang
-LOADED_WITHIN_S = 60.0  # after this time a command is answered even if its scene or model is still loading
-ANSWERED_WITHIN_S = LOADED_WITHIN_S + 10.0  # time limit for a client that waits for a command
-HUNG_AFTER_S = 5.0  # time without a completed turn after which the loop counts as hung
+LOOKED_UP_WITHIN_S = 3.0  # time limit for answers not given by the loop; after that, the page reports a hang
+LOADED_WITHIN_S = 60.0  # after this time, a command is answered even if its scene or model is still loading
+ANSWERED_WITHIN_S = LOADED_WITHIN_S + 10.0  # how long a client waits for the answer to a command
+HUNG_AFTER_S = 5.0  # the loop counts as hung if it completes no turn for this long
 
 
 def user_socket() -> Path | None:
-    """Return the socket of a daemon started in a user's session, or None outside a session."""
+    """Return the socket used by a daemon started in a user's session, or None outside a session."""
     runtime_dir = os.environ.get("XDG_RUNTIME_DIR", "")
     return Path(runtime_dir) / "phasestack" / "status.sock" if runtime_dir else None
 
 
 def candidates(configured: str) -> tuple[Path, ...]:
-    """Return the configured socket, followed by the session's socket inside a user's session."""
+    """Return the configured socket and, inside a user's session, also the session's socket."""
     own = user_socket()
     return (Path(configured),) if own is None else (Path(configured), own)
 
 
 def sockets(config: Path | None) -> tuple[Path, ...]:
-    """Return the sockets to try for a configuration file, or the default sockets if `config` is None.
+    """Return the sockets to try for a given configuration file, or the default ones if `config` is None.
 
     Raises InputError if the file is invalid.
     """
     if config is None:
-        return candidates(DEFAULT_SOCKET)  # without loading the settings, which would slow down clients
+        return candidates(DEFAULT_SOCKET)  # do not load the settings, because that would slow clients down
     from runtime.config import load_settings
 
     return candidates(load_settings(config).service.socket)
 
 
 class NotRunning(TransientError):
-    """Raised when no daemon answers. The message gives the problem with each socket and often a remedy."""
+    """Raised when no daemon answers. The message says what failed at each socket and may give a remedy."""
 
     hangs = False  # True if a daemon accepted the connection but did not answer
 
 
 def ask(paths: Iterable[Path], request: dict[str, Any], *, timeout_s: float = 10.0) -> dict[str, Any]:
-    """Send a request to the first socket at which a daemon answers, and return the answer.
+    """Send a request to the first socket where a daemon answers, and return the answer.
 
     Args:
         paths: Sockets to try, in this order.
-        request: Content of the request, which is sent as JSON.
+        request: The request, to be sent as JSON.
         timeout_s: Time limit for each socket operation.
 
     Raises:
-        NotRunning: No daemon answers at any of the sockets.
+        NotRunning: No daemon answers on any of the sockets.
     """
     problems, hangs = [], False
     for path in paths:
@@ -88,7 +88,7 @@ def _exchanged(path: Path, request: dict[str, Any], timeout_s: float) -> dict[st
         channel.connect(str(path))
         with contextlib.suppress(
             BrokenPipeError, ConnectionResetError
-        ):  # the daemon has refused the request; the answer gives the reason
+        ):  # the daemon has refused the request, and the answer says why
             channel.sendall(json.dumps(request).encode() + b"\n")
         with channel.makefile("rb") as answers:
             line = answers.readline()
@@ -112,7 +112,7 @@ def _advice(error: Exception) -> str:
 
 
 def unit_properties(*names: str) -> dict[str, str]:
-    """Return properties of the systemd unit, or an empty dictionary if the unit is not installed."""
+    """Return some of the systemd unit's properties, or an empty dictionary if it is not installed."""
     command = ["systemctl", "show", UNIT, f"--property=LoadState,{','.join(names)}"]
     try:
         shown = subprocess.run(command, capture_output=True, text=True, timeout=5.0).stdout
@@ -123,7 +123,7 @@ def unit_properties(*names: str) -> dict[str, str]:
 
 
 def unit_advice() -> str:
-    """Return the systemd unit's state, last error and a remedy, or "" if the unit is not installed."""
+    """Describe the systemd unit's state, its last error and a remedy. Returns "" if it is not installed."""
     unit = unit_properties("ActiveState", "Result", "ExecMainStatus", "StatusText")
     if not unit:
         return ""
@@ -141,18 +141,18 @@ def unit_advice() -> str:
 
 
 class DaemonClient:
-    """Thread-safe client of the daemon for the operator's page. All browsers share the cached answers."""
+    """Thread-safe client for the operator's page. Cached answers are shared by all browsers."""
 
     def __init__(self, sockets: tuple[Path, ...]) -> None:
-        """Create a client that tries the given sockets in order."""
+        """Create a client that tries these sockets in order."""
         self._sockets = sockets
         self._locks = {name: threading.Lock() for name in LOOKED_UP_AGAIN_S}
         self._answers: dict[str, tuple[float, dict[str, Any]]] = {}
 
     def look_up(self, name: str) -> dict[str, Any]:
-        """Return the answer to the request `status`, `pictures`, `log` or `about`, which may be cached.
+        """Return the answer, possibly cached, to a `status`, `pictures`, `log` or `about` request.
 
-        The answer's `ok` is False if no daemon answers.
+        If no daemon answers, the returned `ok` is False.
         """
         with self._locks[name]:
             asked_s, answer = self._answers.get(name, (float("-inf"), {}))
@@ -163,7 +163,7 @@ class DaemonClient:
         return answer
 
     def tell(self, command: str, value: Any) -> dict[str, Any]:
-        """Send a command and return the answer, whose `ok` is False if no daemon answers."""
+        """Send a command and return the answer. If no daemon answers, the returned `ok` is False."""
         return self._asked({"command": command, "value": value}, timeout_s=ANSWERED_WITHIN_S)
 
     def _asked(self, request: dict[str, Any], *, timeout_s: float) -> dict[str, Any]:

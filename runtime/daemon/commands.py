@@ -1,4 +1,4 @@
-"""Commands that operators send to the running daemon. They are checked before the loop starts them."""
+"""Commands sent to the running daemon by operators. Each is checked before the loop starts it."""
 
 from __future__ import annotations
 
@@ -10,37 +10,37 @@ from runtime.support.untrusted_input import shown
 
 Name = Literal["scene", "next", "place", "model", "pause", "resume", "flat", "reload", "blackbox"]
 NAMES: tuple[Name, ...] = get_args(Name)
-PLACING = ("scale", "offset_m", "rotation_deg", "turntable_per_min")  # settings in [content] that `place` changes
+PLACING = ("scale", "offset_m", "rotation_deg", "turntable_per_min")  # settings in [content] changed by `place`
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A command that the loop starts between two refreshes and answers exactly once.
+    """A command, started by the loop between two refreshes and answered exactly once.
 
-    Carry out a command only after `take` has returned True, because the client may have given up.
+    Do not carry out a command unless `take` has returned True, because the client may have given up.
     """
 
     name: Name
-    value: Any = None  # scene or model: a name; place: settings, or {} for the configured placement
+    value: Any = None  # for scene and model, a name; for place, settings, or {} to use the configured placement
     answer: Future[dict[str, Any]] = field(default_factory=Future)
 
     def take(self) -> bool:
-        """Claim the command for execution. Returns False if the client has given up."""
+        """Claim the command in order to carry it out. Returns False if the client has given up."""
         return self.answer.set_running_or_notify_cancel()
 
     def done(self, **state: Any) -> None:
-        """Report success to the client, together with the new state."""
+        """Tell the client that the command succeeded, and give the new state."""
         self.answer.set_result({"ok": True, **state})
 
     def refuse(self, why: str) -> None:
-        """Report to the client that the command was refused and that nothing has changed."""
+        """Tell the client that the command was refused and nothing has changed."""
         self.answer.set_result({"ok": False, "error": why or "refused"})
 
 
 def parse(request: Any) -> Command:
-    """Return the command in a request from the socket.
+    """Return the command contained in a request from the socket.
 
-    Raises ValueError with a one-line message if the request is not a valid command.
+    Raises ValueError, with a one-line message, if the request is not a valid command.
     """
     if not isinstance(request, dict):
         raise ValueError("a request must be one JSON object")

@@ -1,4 +1,4 @@
-"""Common part of `demo` and `run`, which runs the loop, shows progress and writes the results."""
+"""Run the display loop for `demo` and `run`, show its progress and write the results."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from runtime.support import progress
 from runtime.support.background import wait_for_all
 from runtime.support.figures import lines_of
 
-JOBS_END_WITHIN_S = 0.5  # time limit for background jobs at the end of a run
-USUAL_M, IPD_M = 0.6, 0.063  # distance and eye separation of a typical viewer, used if no viewer was seen
+JOBS_END_WITHIN_S = 0.5  # how long to wait for background jobs at the end of a run
+USUAL_M, IPD_M = 0.6, 0.063  # a typical viewer's distance and eye separation, used if no viewer was seen
 
 
 def drive(settings: Settings, options: RunOptions, host: Host | None = None) -> dict[str, Any]:
@@ -39,9 +39,9 @@ def drive(settings: Settings, options: RunOptions, host: Host | None = None) -> 
         on_account = advance if options.max_speed else None
         run = build_run(settings, options, cleanup, host, output=output, on_account=on_account)
         reason = run.presenter.run(frames=options.frames)
-        run.presenter.panels.close()  # darkens the panels before the files are written, which may take seconds
+        run.presenter.panels.close()  # go dark first, because writing the files may take several seconds
         for sample in run.presenter.samples.recorded_ahead():
-            run.observer.sampled(sample)  # adds the true eyes at the last display times
+            run.observer.sampled(sample)  # for the true eyes at the last display times
         if output is not None:
             output.run_is_over()
         run.observer.finish(lambda: host is not None and bool(host.stop_reason()))
@@ -59,7 +59,7 @@ def drive(settings: Settings, options: RunOptions, host: Host | None = None) -> 
 
 
 def _unseen(layers: U8, account: RefreshAccount, run: Run, settings: Settings) -> str:
-    """Return the HTML of a viewer with the last refresh, for a run in which no refresh was measured."""
+    """Return the HTML of a viewer page for the last refresh, used if no refresh was measured."""
     stack, is_flat = run.presenter.stack, account.solved_for_m is None
     away_m = max(USUAL_M, stack.x_m[-1] + USUAL_M / 2)
     eyes_m = np.array([[away_m, -IPD_M / 2, 0.0], [away_m, IPD_M / 2, 0.0]])
@@ -70,7 +70,7 @@ def _unseen(layers: U8, account: RefreshAccount, run: Run, settings: Settings) -
 
 
 def print_summary(summary: dict[str, Any], out: Path | None) -> None:
-    """Print a readable summary, the figures to quote and where to look at the result."""
+    """Print the summary in readable form, which figures to quote, and where to look at the result."""
     configured = summary["configured"]
     for line in lines_of({name: value for name, value in summary.items() if name not in (*configured, "configured")}):
         print(line)

@@ -1,4 +1,4 @@
-"""Notifications to systemd (sd_notify and watchdog). Without systemd, every call does nothing."""
+"""Notify systemd (sd_notify and watchdog). Without systemd, all calls do nothing."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from runtime.clock import Clock
 from runtime.records import State
 
 NS_PER_US = 1000
-START_STEP_S = 60.0  # longest time that a step of the start takes on the slowest machine
-SETTLED_AFTER = 100  # refreshes with a longer watchdog period, because the first ones compile shaders for seconds
+START_STEP_S = 60.0  # no startup step takes longer than this, even on the slowest machine
+SETTLED_AFTER = 100  # refreshes with a longer watchdog period, because compiling shaders at first takes seconds
 
 
 class Notifier:
-    """Sender of the daemon's status and watchdog messages to systemd. No method blocks or raises."""
+    """Sends the daemon's status and watchdog messages to systemd. Its methods never block or raise."""
 
     def __init__(self, clock: Clock, environment: Mapping[str, str] = os.environ) -> None:
-        """Connect to systemd, if this process runs under it.
+        """Connect to systemd if it runs this process.
 
         Args:
-            clock: Clock of the run.
-            environment: Environment variables that give the watchdog's period (see sd_watchdog_enabled).
+            clock: The run's clock.
+            environment: Environment variables, which give the watchdog period (see sd_watchdog_enabled).
         """
         self._clock = clock
         self._channel: Any = None
@@ -34,31 +34,31 @@ class Notifier:
             self._channel.socket.setblocking(False)
         self._watchdog_ns = watchdog_ns(environment)
         self._fed_ns = -self._watchdog_ns
-        self._settling = 0  # refreshes left until the normal watchdog period applies
+        self._settling = 0  # number of refreshes until the normal watchdog period applies
         self._status = ""
         self._ready = False
 
     @property
     def supervised(self) -> bool:
-        """True under systemd, where the start waits for missing panels instead of failing."""
+        """True under systemd. Startup then waits for missing panels instead of failing."""
         return self._channel is not None and self._channel.socket is not None
 
     def ready(self) -> None:
-        """Report that the first frame is shown or that the daemon waits for panels. Later calls do nothing."""
+        """Report that the first frame is shown or panels are being waited for. Later calls do nothing."""
         if not self._ready:
             self._ready = True
             self._send("READY=1")
             self.starting()
 
     def status(self, text: str) -> None:
-        """Set the line that `systemctl status` shows. An unchanged line is not sent again."""
+        """Set the line shown by `systemctl status`. If it has not changed, it is not sent again."""
         line = " ".join(text.split())
         if line != self._status:
             self._status = line
             self._send(f"STATUS={line}")
 
     def starting(self) -> None:
-        """Report a step of the start, which extends the timeout of the start or of the watchdog."""
+        """Report progress during startup, which extends the startup or watchdog timeout."""
         step_us = round(START_STEP_S * 1e6)
         if not self._ready:
             self._send(f"EXTEND_TIMEOUT_USEC={step_us}")
@@ -67,15 +67,16 @@ class Notifier:
             self._send(f"WATCHDOG_USEC={step_us}\nWATCHDOG=1")
 
     def refreshed(self, state: State, missing: tuple[str, ...], *, presented: bool) -> None:
-        """Reset the watchdog after a refresh, at most four times per period.
+        """Feed the watchdog after a refresh, at most four times per period.
 
-        A refresh counts if the panels showed it or if a panel is missing. The solver's state does not matter, because
-        the last solution stays on the panels, aligned to the eyes, while the solver fails or restarts. Before READY,
-        the timeout of the start applies. The first hundred refreshes have a longer watchdog period.
+        A refresh counts if the panels showed it or if a panel is missing. It does not matter whether the solver is
+        working, because while it fails or restarts, the last solution stays on the panels and is still aligned to the
+        eyes. Before READY, the startup timeout applies instead. During the first hundred refreshes, the watchdog period
+        is longer.
 
         Args:
-            state: State of the presenter.
-            missing: Names of the missing parts.
+            state: The presenter's state.
+            missing: Names of the parts that have failed.
             presented: True if the panels showed the refresh.
         """
         alive = presented or (state is State.DEGRADED and "panel" in missing)
@@ -91,12 +92,12 @@ class Notifier:
             self._send("WATCHDOG=1")
 
     def reloading(self) -> None:
-        """Report that the configuration is being reloaded. Does nothing before the first READY."""
+        """Report that the configuration is being reloaded. Before the first READY, this does nothing."""
         if self._ready:
             self._send(f"RELOADING=1\nMONOTONIC_USEC={self._clock.now_ns() // NS_PER_US}")
 
     def reloaded(self) -> None:
-        """Report that reloading has ended, whether or not it succeeded."""
+        """Report that reloading is over, whether or not it succeeded."""
         if self._ready:
             self._send("READY=1")
 
@@ -116,6 +117,6 @@ class Notifier:
 
 
 def watchdog_ns(environment: Mapping[str, str]) -> int:
-    """Return the watchdog's period in nanoseconds, or 0 if this process has no watchdog."""
+    """Return the watchdog period in nanoseconds, or 0 if this process has no watchdog."""
     ours = int(environment.get("WATCHDOG_PID", os.getpid())) == os.getpid()
     return int(environment.get("WATCHDOG_USEC", "0")) * NS_PER_US if ours else 0

@@ -1,4 +1,4 @@
-"""Changes of settings during a run, loaded in the background and adopted between two solutions."""
+"""Change a run's settings: load in the background, then adopt between two solutions."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from runtime.support.memory import give_back
 from runtime.support.progress import listening
 from runtime.support.untrusted_input import LIMITS
 
-MODEL_S = 30.0  # enough time to load a model and solve twice at 1920x1080 on a slow PC
+MODEL_S = 30.0  # long enough to load a model and solve twice at 1920x1080 on a slow PC
 Ready = tuple[Opener | None, Predictor | None]  # new content and model; None: unchanged
 
 
 class Reconfiguration:
-    """Change of settings that takes effect as a whole once everything is loaded, or not at all.
+    """A change of settings that takes effect as a whole once everything is loaded, or not at all.
 
-    A background job loads the new content and model, which `advance` then adopts on the solver's thread. The
+    The new content and model are loaded by a background job and then adopted by `advance` on the solver's thread. The
     presenter's thread polls `finished` and then reads `problem`.
     """
 
@@ -42,28 +42,28 @@ class Reconfiguration:
         """Start loading.
 
         Args:
-            read: Function that returns the new settings. The background job calls it. May raise InputError.
-            old: Current settings.
-            stack: Panels of the run.
-            reload_content: Reload the content even if the content settings have not changed.
+            read: Function that returns the new settings. Called by the background job. May raise InputError.
+            old: The current settings.
+            stack: The run's panels.
+            reload_content: True to reload the content even if its settings have not changed.
         """
         self._read, self._old, self._stack, self._reload_content = read, old, stack, reload_content
         self.settings = old
         self._calibration: Calibration
         self.abandoned = False
         self._begun_s = time.monotonic()
-        self.progress = ""  # stage of loading, for the status
-        self.problem = ""  # one-line reason if the change was refused
-        self._adopter: RunningSolver | None = None  # solver that will adopt the change
+        self.progress = ""  # what is being loaded, for the status
+        self.problem = ""  # why the change was refused, in one line
+        self._adopter: RunningSolver | None = None  # the solver that adopts the change
         self._finished = False
         self._job = BackgroundJob("reconfiguration", self._make_ready)
 
     def abandon(self) -> None:
-        """Cancel the change and discard what was loaded."""
+        """Cancel the change and discard anything loaded."""
         self.abandoned = True
 
     def advance(self, parts: Any) -> bool:
-        """Adopt the loaded parts. The solver's thread calls this between steps until it returns True.
+        """Adopt the loaded parts. Called on the solver's thread between steps until it returns True.
 
         Returns:
             True once the change has been adopted, refused or discarded.
@@ -81,15 +81,15 @@ class Reconfiguration:
             else:
                 self._adopter = parts
                 self._take_over(parts, opener, predictor)
-        BackgroundJob("memory", give_back)  # return the memory of the replaced parts to the system
+        BackgroundJob("memory", give_back)  # returns the replaced parts' memory to the system
         self._finished = True
         return True
 
     @property
     def finished(self) -> bool:
-        """Return True once the change is adopted, refused or discarded.
+        """True once the change has been adopted, refused or discarded.
 
-        Also returns True if the solver was replaced during the adoption, or if an abandoned change loads for too long.
+        Also True if the solver has been replaced while adopting it, or if it was abandoned but takes too long to load.
         """
         if not self._finished and self._adopter is not None and not self._adopter.is_newest:
             self.problem, self._finished = LEFT_BEHIND, True
@@ -97,7 +97,7 @@ class Reconfiguration:
         return self._finished or is_stuck
 
     def _make_ready(self) -> Ready:
-        """Read the settings and load new content and a new model if required, on the job's thread."""
+        """Read the settings and, if required, load new content and a new model, on the job's thread."""
         opener = predictor = None
         self.settings = settings = self._read()
         file = settings.calibration.file
@@ -124,12 +124,12 @@ class Reconfiguration:
             self.progress = f"{what}: {done} of {total}" if total else f"{what}: {done}" if done else what
 
     def _take_over(self, parts: RunningSolver, opener: Opener | None, predictor: Predictor | None) -> None:
-        """Replace the run's state and close the replaced parts.
+        """Replace the run's state and close any parts that were replaced.
 
-        If the new content or model fails, keep the old state and set `problem`.
+        If the new content or model fails, the old state is kept and `problem` is set.
         """
         now, moved = parts.run.state.settings.content, {}
-        if now.scene == self.settings.content.scene:  # another scene starts in its configured placement
+        if now.scene == self.settings.content.scene:  # another scene is placed as configured
             moved = moved_since(self._old.content, now)
         placed = self.settings.content.model_copy(update=moved)
         settings = self.settings.model_copy(update={"content": placed})
@@ -150,7 +150,7 @@ class Reconfiguration:
             except PhasestackError as error:
                 self.problem = str(error)
                 return
-            except (Exception, SystemExit) as error:  # raised by a GL driver or a library; keep the current scene
+            except (Exception, SystemExit) as error:  # raised by a GL driver or a library; the scene is kept
                 self.problem = f"{self.settings.content.scene}: {written(error)}"
                 return
             undo.pop_all()
@@ -163,16 +163,16 @@ class Reconfiguration:
 def _tried(settings: Settings) -> None:
     """Load an untrusted model and solve with it.
 
-    This runs in a child process, where a crash cannot harm the daemon.
+    Runs in a child process, so that a crash cannot harm the daemon.
     """
     ready_predictor(settings, settings.stack.stack()).close()
 
 
 def moved_since(before: ContentSettings, now: ContentSettings) -> dict[str, Any]:
-    """Return the placement settings in `now` that differ from those in `before`."""
+    """Return all placement settings in `now` that differ from those in `before`."""
     return {key: getattr(now, key) for key in PLACING if getattr(now, key) != getattr(before, key)}
 
 
 def _model_part(settings: Settings) -> Any:
-    """Return the model settings to compare, with constants for those that require no new predictor."""
+    """Return the model settings to compare, with constants in place of any that need no new predictor."""
     return settings.model.model_copy(update={"budget_ms": 0.0, "eye_sigma_mm": "auto"})

@@ -1,7 +1,7 @@
-"""Server of the status and control socket, which exchanges JSON lines on a separate thread.
+"""Serve the status and control socket, exchanging JSON lines on a separate thread.
 
-Slow, hanging or numerous clients cannot block the server, because requests and answers have time limits. If all
-connections are in use, a new client replaces the client whose request has been incomplete for the longest time.
+The server cannot be blocked by slow or hanging clients or by many clients, because there are time limits for requests
+and answers. If all connections are in use, a new client replaces the one whose request has been incomplete for longest.
 """
 
 from __future__ import annotations
@@ -31,42 +31,42 @@ from runtime.support.background import BACKGROUND_NICENESS, begin, patience_s, s
 
 log = logging.getLogger("phasestack.service")
 
-CLIENTS_MAX = 64  # simultaneous connections
-LOOP_ANSWERS_WITHIN_S = 5.0  # time limit for the loop to start a command
-LOOKED_AGAIN_S = 0.1  # interval between checks that the client is still connected
+CLIENTS_MAX = 64  # maximum number of simultaneous connections
+LOOP_ANSWERS_WITHIN_S = 5.0  # how long to wait for the loop to start a command
+LOOKED_AGAIN_S = 0.1  # interval for checking that the client is still connected
 
 
 class Refusal(Exception):
-    """Raised to disconnect a client. The message is the reason that the client receives."""
+    """Raised to disconnect a client. The message is sent to the client as the reason."""
 
 
 class StatusServer:
-    """Server that answers `status` from the last published snapshot and queues commands for the loop.
+    """Answers `status` from the latest published snapshot, and queues commands for the loop.
 
-    The presenter's loop calls `publish`, takes `commands` and never waits for a client. Requests for the status are
-    answered even if the loop hangs. Such an answer contains the time since the loop's last turn.
+    The presenter's loop calls `publish` and takes from `commands`, and never waits for a client. Even if the loop
+    hangs, status requests are answered, and each answer gives the time since the loop's last turn.
     """
 
     def __init__(self, path: Path, *, clock: Clock) -> None:
         """Create the socket and start serving.
 
         Args:
-            path: Path of the socket.
-            clock: Clock of the run.
+            path: Path to the socket.
+            clock: The run's clock.
 
         Raises:
-            SocketInUse: Another phasestack process owns the socket.
+            SocketInUse: Another phasestack process is using the socket.
             InputError: The socket cannot be created.
             TransientError: The thread cannot be started.
         """
         self.path = path
         self.commands: queue.SimpleQueue[Command] = queue.SimpleQueue()
-        self.lookups: dict[str, Callable[[], dict[str, Any]]] = {}  # answers by request, called on the server's thread
+        self.lookups: dict[str, Callable[[], dict[str, Any]]] = {}  # by request; called on the server's thread
         self._clock = clock
         self._started_ns = clock.now_ns()
         self._snapshot: tuple[int, Callable[[], dict[str, Any]]] = (self._started_ns, dict)
         self._clients: set[asyncio.Task[None]] = set()
-        self._reading: dict[asyncio.Task[None], None] = {}  # clients with an incomplete request, oldest first
+        self._reading: dict[asyncio.Task[None], None] = {}  # clients whose request is incomplete, longest first
         listening = listening_socket(path)
         self._own = path.lstat().st_ino
         self._loop = asyncio.new_event_loop()
@@ -76,26 +76,26 @@ class StatusServer:
         self._thread: threading.Thread | None = begin("status", self._run)
 
     def publish(self, snapshot: Callable[[], dict[str, Any]]) -> None:
-        """Set the function that creates the status. Called once per turn of the loop.
+        """Set the function that creates the status. Called once per loop turn.
 
-        The function runs on the server's thread, and only when a client asks for the status. A turn without requests
-        therefore costs nothing. The function may only read values that no longer change.
+        The function is called on the server's thread, and only when a client requests the status, so without requests a
+        turn costs nothing. It may read only values that no longer change.
         """
         self._snapshot = (self._clock.now_ns(), snapshot)
 
     def close(self) -> None:
-        """Answer the connected clients, stop the server and remove the socket. May be called twice."""
+        """Answer all connected clients, stop the server and remove the socket. May be called more than once."""
         thread, self._thread = self._thread, None
         if thread is None:
             return
         self._loop.call_soon_threadsafe(self._loop.stop)
         thread.join(patience_s(2.0))
         with contextlib.suppress(OSError):
-            if self.path.lstat().st_ino == self._own:  # otherwise the file belongs to another daemon
+            if self.path.lstat().st_ino == self._own:  # if not, another daemon has replaced it
                 self.path.unlink()
 
     def answer(self, line: bytes) -> dict[str, Any] | Command:
-        """Return the answer to a request, or the command that the loop must carry out."""
+        """Return the answer to a request, or a command for the loop to carry out."""
         try:
             request = json.loads(line)
         except (ValueError, RecursionError):
@@ -121,7 +121,7 @@ class StatusServer:
             **snapshot(),
         }
 
-    # The methods below run on the server's thread.
+    # All methods below run on the server's thread.
 
     def _run(self) -> None:
         set_niceness(BACKGROUND_NICENESS)
@@ -131,19 +131,19 @@ class StatusServer:
 
     async def _end(self) -> None:
         self._server.close()
-        for _ in range(16):  # also answer clients that have just connected
+        for _ in range(16):  # for clients that have only just connected
             await asyncio.sleep(0)
         clients = asyncio.all_tasks() - {asyncio.current_task()}
         for client in clients:
             client.cancel("the daemon is stopping")
         await asyncio.gather(*clients, return_exceptions=True)
-        await asyncio.sleep(0)  # lets asyncio close the connections
+        await asyncio.sleep(0)  # so that asyncio can close the connections
 
     async def _serve(self, reader: StreamReader, writer: StreamWriter) -> None:
-        """Answer a client's requests until it disconnects."""
+        """Answer requests from one client until it disconnects."""
         task = asyncio.current_task()
         assert task is not None
-        writer.transport.set_write_buffer_limits(high=0)  # makes `drain` wait until the whole answer is sent
+        writer.transport.set_write_buffer_limits(high=0)  # so that `drain` waits until all of an answer is sent
         try:
             self._make_room()
             self._clients.add(task)
@@ -153,7 +153,7 @@ class StatusServer:
                     await writer.drain()
         except (Refusal, asyncio.CancelledError) as why:
             writer.write(_line({"ok": False, "error": why.args[0]}))
-        except (OSError, TimeoutError):  # the client has disconnected or does not read
+        except (OSError, TimeoutError):  # the client has disconnected or is not reading
             writer.transport.abort()
         finally:
             self._clients.discard(task)
@@ -162,7 +162,7 @@ class StatusServer:
             writer.close()
 
     def _make_room(self) -> None:
-        """Disconnect the client with the oldest incomplete request if all connections are in use.
+        """If all connections are in use, disconnect the client with the oldest incomplete request.
 
         Raises Refusal if no client has an incomplete request.
         """
@@ -171,13 +171,13 @@ class StatusServer:
             if longest is None:
                 raise Refusal("too many clients")
             self._reading.pop(longest)
-            self._clients.discard(longest)  # before its task ends, because more clients may connect
+            self._clients.discard(longest)  # not only when its task ends, because more clients may connect
             longest.cancel("too many clients")
 
     async def _request(self, reader: StreamReader, task: asyncio.Task[None]) -> bytes:
-        """Return the next request with its newline or, at the end of the input, an incomplete request.
+        """Return the next request, including its newline. At end of input, it may be incomplete.
 
-        Raises Refusal if the request is too long or does not arrive in time.
+        Raises Refusal if a request is too long or does not arrive in time.
         """
         self._reading[task] = None
         try:
@@ -208,7 +208,7 @@ class StatusServer:
 
 
 def _log_error(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """Log an error of the event loop, such as a lack of file descriptors. Asyncio then tries again."""
+    """Log an error in the event loop, such as a shortage of file descriptors. Asyncio then tries again."""
     log.warning("status: %s", one_line(f"{context.get('message')} ({context.get('exception')})"))
 
 
@@ -217,7 +217,7 @@ def _line(answer: dict[str, Any]) -> bytes:
 
 
 def _is_gone(writer: StreamWriter) -> bool:
-    """Return True if a client has disconnected, and False if it has only stopped sending."""
+    """Return True if a client has disconnected, or False if it has only stopped sending."""
     if writer.is_closing():
         return True
     hung_up = select.poll()
@@ -226,10 +226,10 @@ def _is_gone(writer: StreamWriter) -> bool:
 
 
 async def _outcome(command: Command, writer: StreamWriter) -> dict[str, Any]:
-    """Wait for the outcome of a command and return the answer.
+    """Wait for a command's outcome and return the answer.
 
-    The command is cancelled if the loop does not start it in time or if the client disconnects. Raises Refusal if the
-    server stops.
+    The command is cancelled if the loop does not start it in time or the client disconnects. Raises Refusal if the
+    server is stopped.
     """
     answer = asyncio.wrap_future(command.answer)
     until_s = time.monotonic() + LOOP_ANSWERS_WITHIN_S
@@ -249,22 +249,22 @@ async def _outcome(command: Command, writer: StreamWriter) -> dict[str, Any]:
 
 
 def open_status_server(settings: ServiceSettings, *, clock: Clock, supervised: bool) -> StatusServer | None:
-    """Open the configured socket and start the server.
+    """Open the configured socket and start serving.
 
-    If the default socket is configured but its folder is not writable, the socket of the user's session is opened
-    instead. If no socket can be opened, an unsupervised run logs a warning and continues without a server.
+    If the default socket is configured but its folder is not writable, the user's session socket is used instead. If no
+    socket can be opened, an unsupervised run logs a warning and continues without a server.
 
     Args:
-        settings: Settings that give the path of the socket.
-        clock: Clock of the run.
-        supervised: True if systemd started the run.
+        settings: Settings, which include the path to the socket.
+        clock: The run's clock.
+        supervised: True if the run was started by systemd.
 
     Returns:
-        The server, or None if an unsupervised run cannot open a socket.
+        The server, or None if the run is unsupervised and cannot open a socket.
 
     Raises:
-        SocketInUse: Another phasestack process owns the socket of a supervised run.
-        InputError: The socket of a supervised run cannot be created.
+        SocketInUse: The run is supervised, and another phasestack process is using the socket.
+        InputError: The run is supervised, and the socket cannot be created.
     """
     path = Path(settings.socket)
     own = user_socket()

@@ -1,4 +1,4 @@
-"""Signal handlers, which set flags that the loop polls."""
+"""Signal handlers that set flags for the loop to poll."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from runtime.support.background import STOPS_WITHIN_S, ends_by
 
 
 class Signals:
-    """Context manager that handles SIGTERM and SIGINT (stop) and SIGHUP (reload) by setting flags.
+    """Context manager that sets flags on SIGTERM and SIGINT (stop) and on SIGHUP (reload).
 
-    If a stop has already been requested, SIGINT raises KeyboardInterrupt. Use the context manager on the main thread.
-    The previous handlers are restored on exit.
+    If a stop has already been requested, SIGINT raises KeyboardInterrupt. For use on the main thread. The previous
+    handlers are restored on exit.
     """
 
     def __init__(self) -> None:
-        self.stop = ""  # name of the signal that requested the stop; empty if none has
+        self.stop = ""  # the signal that requested a stop; empty if none has
         self._reload = False
         self._previous: dict[signal.Signals, Any] = {}
 
@@ -35,7 +35,7 @@ class Signals:
         ends_by(math.inf)
 
     def take_reload(self) -> bool:
-        """Return True if a reload signal has arrived since the last call."""
+        """Return True if a reload signal has been received since the last call."""
         asked, self._reload = self._reload, False
         return asked
 

@@ -1,4 +1,4 @@
-"""Creation of the status socket's file (mode 0660), which replaces the file of a crashed daemon."""
+"""Create the status socket's file (mode 0660), replacing one left over by a crashed daemon."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from runtime.errors import InputError, TransientError
 log = logging.getLogger("phasestack.service")
 
 GROUP = "phasestack"  # group whose members may use the socket
-BACKLOG = 64  # maximum number of connections not yet accepted
-LOCKED_WITHIN_S = 2.0  # time limit for locking the folder; daemons hold the lock only briefly
+BACKLOG = 64  # maximum number of connections waiting to be accepted
+LOCKED_WITHIN_S = 2.0  # how long to wait for the folder's lock, which daemons hold only briefly
 
 
 class SocketInUse(TransientError):
-    """Raised when another phasestack process owns the socket. The message gives the process ID, if known."""
+    """Raised when another phasestack process is using the socket. The message gives its ID, if known."""
 
 
 def listening_socket(path: Path) -> socket.socket:
-    """Create a socket that listens at `path`.
+    """Create a socket that listens on `path`.
 
     Raises:
-        SocketInUse: Another phasestack process owns the socket.
+        SocketInUse: Another phasestack process is using the socket.
         InputError: The socket cannot be created.
     """
     made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -39,7 +39,7 @@ def listening_socket(path: Path) -> socket.socket:
         path.parent.mkdir(parents=True, exist_ok=True)
         with _locked(path.parent):
             _remove_dead(path)
-            # Set the mode by umask, because before a chmod the file would have another mode.
+            # Use the umask, because with a chmod the file would briefly have another mode.
             mask = os.umask(0o117)
             try:
                 made.bind(str(path))
@@ -54,7 +54,7 @@ def listening_socket(path: Path) -> socket.socket:
         raise
     try:
         group = grp.getgrnam(GROUP).gr_gid
-        if path.lstat().st_gid != group:  # a sandbox may refuse even a chown that changes nothing
+        if path.lstat().st_gid != group:  # a sandbox may refuse a chown even if it would change nothing
             os.chown(path, -1, group)
     except (KeyError, PermissionError):
         log.info("only this user can use the status socket; the group %s does not exist or lacks this user", GROUP)
@@ -63,14 +63,14 @@ def listening_socket(path: Path) -> socket.socket:
 
 @contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Lock a folder to prevent two daemons from replacing a dead socket at the same time.
+    """Lock a folder, so that no two daemons replace a dead socket at the same time.
 
     If the lock is not available within `LOCKED_WITHIN_S`, continue without it.
     """
     opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         until_s = time.monotonic() + LOCKED_WITHIN_S
-        while time.monotonic() < until_s:  # limited, because another program may never release the lock
+        while time.monotonic() < until_s:  # stop at some point, because another program may never release the lock
             with contextlib.suppress(BlockingIOError):
                 fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 break
@@ -81,10 +81,10 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _remove_dead(path: Path) -> None:
-    """Remove the socket of a dead daemon.
+    """Remove a dead daemon's socket.
 
     Raises:
-        SocketInUse: A daemon is listening at the socket.
+        SocketInUse: A daemon is listening on the socket.
         InputError: The file is not a socket.
     """
     if not os.path.lexists(path):
@@ -100,7 +100,7 @@ def _remove_dead(path: Path) -> None:
             path.unlink()
             return
         except BlockingIOError:
-            pass  # the backlog is full, which means that a daemon is listening
+            pass  # the backlog is full, so a daemon is listening
         else:
             pid, _, _ = struct.unpack("3i", probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
             owner = f" (pid {pid})"

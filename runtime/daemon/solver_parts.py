@@ -1,4 +1,4 @@
-"""Solver with its GL context, content and model, all created, used and released on one thread."""
+"""A solver with its GL context, content and model, all created, used and released on one thread."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ log = logging.getLogger("phasestack.solver")
 
 @dataclass(eq=False)
 class RunningSolver:
-    """Implementation of `SolverParts` for a run. Created and used on one thread."""
+    """`SolverParts` for a run. Created and used on one thread."""
 
     run: RunCell
     solver: Solver
-    backend: Choice  # device on which the solver runs, with any model
+    backend: Choice  # device to run the solver on, with any model
     context: Any  # GL context, current on this thread
     owns_context: bool  # True if `close` also releases the context
-    contexts_lost: Callable[[], int]  # returns the number of contexts that the panels have lost
-    generation: int  # number of this solver within the run
-    _owned: RunState = field(init=False)  # state whose parts `close` releases if another solver has started
+    contexts_lost: Callable[[], int]  # returns the number of contexts lost by the panels
+    generation: int  # this solver's number within the run
+    _owned: RunState = field(init=False)  # `close` releases this state's parts if another solver has started
 
     def __post_init__(self) -> None:
         self._owned, self._lost_before = self.run.state, self.contexts_lost()
@@ -49,7 +49,7 @@ class RunningSolver:
         return self.run.generation == self.generation
 
     def replace(self, **changes: Any) -> RunState:
-        """Replace parts of the run's state and return the old state, as `RunCell.replace` does.
+        """Replace parts of the run's state and return the old state, like `RunCell.replace`.
 
         Raises Stopped if another solver has started.
         """
@@ -59,13 +59,13 @@ class RunningSolver:
 
     @property
     def content(self) -> ContentSource:
-        """Return the current content."""
+        """The current content."""
         return self.run.state.content
 
     def step(self, request: SolveRequest) -> SolverUpdate:
         if self.contexts_lost() != self._lost_before:
             raise ContextLost("the panels have lost their OpenGL context")
-        state = self.run.state  # read the state before checking whether another solver has started
+        state = self.run.state  # must be read before checking whether another solver has started
         if not self.is_newest:
             raise Stopped("this solver was abandoned")
         self._owned = state
@@ -83,12 +83,12 @@ class RunningSolver:
         for release in (state.content.close, state.predictor.close, self.backend.backend.close, *own):
             try:
                 release()
-            except Exception as error:  # for example because the context is lost
+            except Exception as error:  # for example because the context was lost
                 log.warning("closing the solver: %s", error)
 
 
 class SolverMaker:
-    """Factory for solvers, called on the thread of each new solver, at the start and after a hang."""
+    """Creates a solver at startup and after each hang. Called on the new solver's thread."""
 
     def __init__(
         self,
@@ -98,27 +98,27 @@ class SolverMaker:
         *,
         contexts_lost: Callable[[], int] = lambda: 0,
     ) -> None:
-        """Create a factory for the solvers of one run.
+        """Create a factory for one run's solvers.
 
         Args:
-            settings: Settings of the first solver. Later solvers use the run's current settings.
-            stack: Panels of the run.
-            calibration: Calibration of the run.
-            contexts_lost: Function that returns the number of GL contexts that the panels have lost. It may be called
-                on any thread.
+            settings: Settings for the first solver. Later solvers use the run's current settings.
+            stack: The run's panels.
+            calibration: The run's calibration.
+            contexts_lost: Function that returns the number of GL contexts lost by the panels. May be called on any
+                thread.
         """
         self._settings, self._stack, self._calibration = settings, stack, calibration
         self.run: RunCell | None = None  # set when the first solver is made
-        self.parts: RunningSolver | None = None  # newest solver
+        self.parts: RunningSolver | None = None  # the latest solver
         self._device: Wanted = settings.model.backend
         self._contexts_lost = contexts_lost
         self._prepared: tuple[ContentSettings, Opener] | None = None  # content that was read but not yet opened
 
     def __call__(self, *, context: Any = None, simulated: bool = False) -> RunningSolver:
-        """Create a solver with the current settings. After an error, everything opened so far is closed.
+        """Create a solver with the current settings. If this fails, everything opened so far is closed.
 
         Args:
-            context: GL context that the solver shares with the panels. None: create a new context.
+            context: GL context to share with the panels. None creates a new context.
             simulated: True if the run's clock is simulated.
 
         Raises:
@@ -159,16 +159,16 @@ class SolverMaker:
         return parts
 
     def _opener(self, content: ContentSettings) -> Opener:
-        """Return the opener of the content. Content that a previous solver read but never opened is reused."""
+        """Return the content's opener. If a previous solver read this content but never opened it, reuse it."""
         prepared = self._prepared
         if prepared is None or prepared[0] != content:
             prepared = self._prepared = content, prepare_content(content, self._stack)
         return prepared[1]
 
     def _chosen(self, predictor: Predictor, context: Any, *, simulated: bool) -> Choice:
-        """Choose the device on which the solver runs. After a restart, the device stays the same.
+        """Choose the device to run the solver on. After a restart, the device stays the same.
 
-        On a simulated clock, `auto` always selects the CPU, because two runs must be identical to the byte.
+        On a simulated clock, `auto` always means the CPU, because any two runs must match byte for byte.
         """
         device = "cpu" if simulated and self._device == "auto" else self._device
         choice = choose(device, predictor, lambda: context)
@@ -181,7 +181,7 @@ def ready_predictor(settings: Settings, stack: PanelStack) -> Predictor:
 
     Raises:
         InputError: The model cannot be used.
-        MissingPart: A package that the model requires is not installed.
+        MissingPart: A package required by the model is not installed.
     """
     predictor = load_predictor(settings.model.name, stack, settings.model)
     try:

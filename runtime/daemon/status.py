@@ -1,4 +1,4 @@
-"""Answers of the status socket about a run: status, constant facts and pictures."""
+"""Answers given on the status socket about a run: its status, constant facts and pictures."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ from runtime.records import U8, RefreshAccount
 from runtime.support.film import VIDEOS
 from runtime.support.version import version
 
-LIBRARY_MOST, LIBRARY_LOOKED_AT = 200, 2000  # limits for listed scenes and for examined folder entries
-IN_LIBRARY = {*PICTURES, *VIDEOS, *MESHES, *PLAYLISTS, *SPLATS}  # suffixes of files that can be scenes
+LIBRARY_MOST, LIBRARY_LOOKED_AT = 200, 2000  # limits: how many scenes are listed, how many folder entries are examined
+IN_LIBRARY = {*PICTURES, *VIDEOS, *MESHES, *PLAYLISTS, *SPLATS}  # suffixes of files that can be used as scenes
 
 
 def placing_in(settings: Settings) -> dict[str, Any]:
-    """Return the current values of the settings that `ctl place` can change."""
+    """Return the current values of all settings that `ctl place` can change."""
     return settings.content.model_dump(include=set(PLACING))
 
 
 def holds(presenter: Presenter) -> dict[str, Any]:
-    """Return the scene, model, placement and pause in effect, which answers to commands contain."""
+    """Return the current scene, model, placement and pause, for inclusion in answers to commands."""
     state = presenter.run_cell.state
     return {
         "scene": state.settings.content.scene,
@@ -51,7 +51,7 @@ def holds(presenter: Presenter) -> dict[str, Any]:
 
 
 def shown(presenter: Presenter, account: RefreshAccount, link: BrowserLink) -> dict[str, Any]:
-    """Return the figures of the newest refresh for a page that shows the panels."""
+    """Return the values from the latest refresh, for use by a page that displays the panels."""
     assert presenter.last is not None
     frame, solution = presenter.last.frame, presenter.last.solution
     return {
@@ -70,7 +70,7 @@ def shown(presenter: Presenter, account: RefreshAccount, link: BrowserLink) -> d
 
 
 def snapshot(run: Run, account: RefreshAccount) -> dict[str, Any]:
-    """Return the answer to a `status` request after a refresh."""
+    """Return the answer to a `status` request after a given refresh."""
     presenter = run.presenter
     machine, stats, state = presenter.machine, presenter.stats, presenter.run_cell.state
     return {
@@ -92,7 +92,7 @@ def snapshot(run: Run, account: RefreshAccount) -> dict[str, Any]:
         "eyes_label": account.eyes_label,
         "eye_sigma_now_mm": account.eye_sigma_mm,
         "solution": account.solution,
-        # A solution for a time after this display time has no age yet.
+        # A solution computed for a time after this display time has no age yet.
         "solution_age_now_ms": None if account.solution_age_ms is None else max(0.0, account.solution_age_ms),
         "effort": account.effort,
         "light_db": None if run.observer.moment is None else run.observer.moment.light_db,
@@ -107,14 +107,14 @@ def snapshot(run: Run, account: RefreshAccount) -> dict[str, Any]:
 
 
 def _view_error_now_mm(account: RefreshAccount) -> float | None:
-    """Return the view error of the tracked eyes in mm, or None without a viewer or a solution."""
+    """Return the view error for the tracked eyes, in mm, or None without a viewer or a solution."""
     if account.eyes_m is None or account.solved_for_m is None:
         return None
     return round(view_error_mm(account.eyes_m, account.solved_for_m), 2)
 
 
 def about(run: Run) -> dict[str, Any]:
-    """Return the constant facts of a run and the available models and scenes, for the page."""
+    """Return a run's constant facts and the available models and scenes, for use by the page."""
     settings, stack = run.presenter.run_cell.state.settings, run.presenter.stack
     return {
         "version": version(),
@@ -128,9 +128,9 @@ def about(run: Run) -> dict[str, Any]:
 
 
 def library_scenes(settings: ContentSettings) -> tuple[str, ...]:
-    """Return the paths of up to `LIBRARY_MOST` scenes in the library folder.
+    """List the paths of scenes in the library folder, at most `LIBRARY_MOST` of them.
 
-    Names that are not printable UTF-8 are skipped, because settings cannot contain such names.
+    A name that is not printable UTF-8 is skipped, because it cannot be used in settings.
     """
     if not settings.library:
         return ()
@@ -144,7 +144,7 @@ def library_scenes(settings: ContentSettings) -> tuple[str, ...]:
 
 
 def pictures(run: Run) -> dict[str, Any]:
-    """Return thumbnails of the newest refresh for the page, as JPEG files in base64."""
+    """Return thumbnails of the latest refresh for the page, as base64-encoded JPEG files."""
     refresh = run.presenter.last
     if refresh is None:
         return {"frame": None, "jpegs": {}}
@@ -153,15 +153,16 @@ def pictures(run: Run) -> dict[str, Any]:
     return {"frame": refresh.account.frame, "jpegs": {name: b64encode(jpeg).decode() for name, jpeg in jpegs.items()}}
 
 
-WIDTH_PX = 256  # width of the thumbnails on the page
+WIDTH_PX = 256  # width of each thumbnail on the page
 JPEG_QUALITY = 80
 
 
 def pictures_of(refresh: Refresh, stack: PanelStack, *, fov_deg: float) -> dict[str, bytes]:
-    """Return thumbnails of a refresh as JPEG files, by name.
+    """Return thumbnails of a refresh as JPEG files, keyed by name.
 
-    The layers are named `layer-0` (rear panel), `layer-1` and so on. The eyes' views, `seen-left` and `seen-right`, are
-    computed from reduced layers at the eyes solved for, because exact views would take longer than a refresh.
+    The layers are named `layer-0` (the rear panel), `layer-1` and so on. Each eye's view, `seen-left` and `seen-right`,
+    is computed from reduced layers at the eye position that was solved for, because an exact view would take longer
+    than a refresh.
     """
     frame, account = refresh.frame, refresh.account
     is_flat = frame.solved is None or (frame.flat is not None and frame.flatness > 0.5)
@@ -173,7 +174,7 @@ def pictures_of(refresh: Refresh, stack: PanelStack, *, fov_deg: float) -> dict[
     size = small.width_px, small.height_px
     part = slice(
         None, None, max(1, shown.shape[2] // (2 * width))
-    )  # sampled at twice the size, because averaging all pixels takes 15 ms
+    )  # first sample at twice the final size, because averaging all pixels takes 15 ms
     parts = (np.ascontiguousarray(layer[part, part]) for layer in shown)
     resized = [cv2.resize(layer, size, interpolation=cv2.INTER_AREA) for layer in parts]
     layers: U8 = np.stack(resized).astype(np.uint8, copy=False)
@@ -186,7 +187,7 @@ def pictures_of(refresh: Refresh, stack: PanelStack, *, fov_deg: float) -> dict[
 
 
 def _jpeg(image: U8) -> bytes:
-    """Encode an (h, w, 3 or 4) picture as JPEG. Drops the fourth channel."""
+    """Encode a picture (h, w, 3 or 4) as JPEG, without any fourth channel."""
     done, coded = cv2.imencode(".jpg", image[..., 2::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     if not done:
         raise ValueError("OpenCV could not encode a picture as JPEG")

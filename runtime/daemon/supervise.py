@@ -1,4 +1,4 @@
-"""Supervisor of a run, which handles signals, systemd, the status socket and operators' commands."""
+"""Supervise a run: handle signals, systemd, the status socket and operator commands."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ PANEL_RETRY_S = 1.0  # interval between attempts to find a missing panel
 
 
 class Daemon(Host):
-    """Supervisor that handles signals and commands and publishes the status between refreshes.
+    """Handles signals and commands, and publishes the status, between refreshes.
 
-    Only the presenter's thread may call the methods. The status server's thread calls the last published snapshot and
-    the functions in the server's `lookups`, which read only frozen values and thread-safe counters.
+    All methods must be called on the presenter's thread. The status server's thread calls only the latest published
+    snapshot and the functions in the server's `lookups`, and these read only frozen values and thread-safe counters.
     """
 
     def __init__(
@@ -54,21 +54,21 @@ class Daemon(Host):
         """Create a supervisor for one run.
 
         Args:
-            read_settings: Function that reads the configuration, called on the loading thread. May raise InputError.
-            signals: Flags that are set by signals.
-            notifier: Sender of messages to systemd.
-            server: Status server. None: no status socket.
-            recorder: Black box. None: no black box.
-            options: Options of the run.
+            read_settings: Function that reads the configuration. Called on the loading thread. May raise InputError.
+            signals: Flags set by signals.
+            notifier: Sends messages to systemd.
+            server: Status server, or None for no status socket.
+            recorder: Black box, or None for no black box.
+            options: The run's options.
         """
         self._until = (options or RunOptions()).until
         self._link = (options or RunOptions()).browser
         self._read_settings = read_settings
         self._signals, self._notifier, self._server = signals, notifier, server
         self.recorder = recorder
-        self.run: Run | None = None  # set together with `changes` once the run is built
+        self.run: Run | None = None  # set, like `changes`, once the run has been built
         self.changes: Changes | None = None
-        self._waits_for = ""  # reason for waiting for a panel before the first refresh
+        self._waits_for = ""  # why the daemon is waiting for a panel before the first refresh
 
     def stop_reason(self) -> str:
         return f"{self._signals.stop} received" if self._signals.stop else self._until()
@@ -83,7 +83,7 @@ class Daemon(Host):
             changes.attempt(command, partial(self._carry_out, presenter, changes, command))
         while self._server is not None and not self._server.commands.empty():
             command = self._server.commands.get()
-            if command.take():  # otherwise the client has given up
+            if command.take():  # if not, the client has given up
                 changes.attempt(command, partial(self._carry_out, presenter, changes, command))
         changes.carry_on()
 
@@ -107,9 +107,9 @@ class Daemon(Host):
             self._server.lookups |= {"log": self.recorder.look_at_log} if self.recorder is not None else {}
 
     def wait_for_panel(self, why: str) -> bool:
-        """Report a missing panel and wait a second before the next attempt.
+        """Report a missing panel, and wait a second before the next attempt.
 
-        Returns False, which ends the start, without systemd or after a stop signal.
+        Without systemd or after a stop signal, returns False, which ends startup.
         """
         if not self._notifier.supervised or self._signals.stop:
             return False
@@ -124,9 +124,9 @@ class Daemon(Host):
         return not self._signals.stop
 
     def starting(self, doing: str) -> bool:
-        """Report the current step of the start and ask systemd for more time.
+        """Report the current startup step and ask systemd for more time.
 
-        Returns False after a stop signal.
+        After a stop signal, returns False.
         """
         self._notifier.starting()
         self._notifier.status(f"starting ({doing})")
@@ -160,7 +160,7 @@ class Daemon(Host):
                 self._write_black_box(command)
 
     def _write_black_box(self, command: Command) -> None:
-        """Write the black box to a file. The writing thread answers the command."""
+        """Write the black box to a file. The command is answered by the thread that writes it."""
         if self.recorder is None:
             command.refuse("this run has no black box (service.blackbox_minutes is 0)")
             return
@@ -175,7 +175,7 @@ class Daemon(Host):
 
 
 def _news(loading: Reconfiguration | None, refused: str, recorder: Recorder | None) -> dict[str, Any]:
-    """Return status entries about the change being loaded, the last refusal and the black box."""
+    """Return the status entries about the change being loaded, the last refusal and the black box."""
     news: dict[str, Any] = {} if loading is None else {"loading": loading.progress}
     if refused:
         news["refused"] = refused
@@ -184,17 +184,17 @@ def _news(loading: Reconfiguration | None, refused: str, recorder: Recorder | No
 
 @retry_advised()
 def run_daemon(read_settings: Callable[[], Settings], options: RunOptions) -> dict[str, Any]:
-    """Run the daemon from start to stop and return its summary.
+    """Run the daemon until it stops, and return its summary.
 
     Args:
-        read_settings: Function that reads the configuration, called at the start and at each reload.
-        options: Options of the run.
+        read_settings: Function that reads the configuration. Called at startup and on each reload.
+        options: The run's options.
 
     Raises:
-        FatalError: The configuration or a file cannot be used.
-        TransientError: The run failed, but another start may succeed.
+        FatalError: The configuration or another file cannot be used.
+        TransientError: The run failed, but starting it again may succeed.
     """
-    keep_freed_memory()  # must precede the start of any thread
+    keep_freed_memory()  # before any thread is started
     settings = read_settings()
     service, clock = settings.service, MonotonicClock()
     logs.configure()
@@ -220,7 +220,7 @@ def run_daemon(read_settings: Callable[[], Settings], options: RunOptions) -> di
         except PanelLost:
             if not signals.stop:
                 raise
-            summary = {"stopped": daemon.stop_reason()}  # stopped while waiting for a panel
+            summary = {"stopped": daemon.stop_reason()}  # it was stopped while waiting for a panel
         notifier.stopping(summary["stopped"])
     log.info("stopped: %s", summary["stopped"])
     return summary

@@ -1,1 +1,1 @@
-"""The display loop, with presenter, solver, pacing, policy, states and statistics."""
+"""The display loop: presenter, solver, pacing, policy, states and statistics."""

@@ -1,4 +1,4 @@
-"""Build requests to the solver: choose the effort, and predict the eyes for the display time."""
+"""Build solver requests: choose the effort, and predict the eyes for the display time."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from runtime.frame.solver_host import SolverHost
 from runtime.frame.viewer import Viewer
 from runtime.records import F64, Effort, EyesEstimate, EyesLabel, FrameTiming, Solution, SolveRequest
 
-HORIZON_NS = NS_PER_S // 8  # longest prediction of the eyes, counted from the display time of the present refresh
-SPEED_NS = NS_PER_S // 2  # time constant of the running mean of the head's squared speed
+HORIZON_NS = NS_PER_S // 8  # how far ahead the eyes are predicted at most, from the current refresh's display time
+SPEED_NS = NS_PER_S // 2  # time constant for the running mean of the head's squared speed
 REQUESTS_KEPT = 256
-CALM_M_S = 0.02  # a seated viewer's head sways more slowly than this; deliberate motion is faster
-WORTH = 0.995  # refine only if the expected error falls below this share of the current one
+CALM_M_S = 0.02  # a seated viewer's head sways more slowly than this; deliberate movements are faster
+WORTH = 0.995  # refine only if the expected error would fall below this share of the current error
 
 
 class Aim:
-    """Builds the requests to the solver during one run.
+    """Builds solver requests during one run.
 
-    The class is not thread-safe. It never reads a clock.
+    Not thread-safe. Never reads a clock.
     """
 
     def __init__(self, viewer: Viewer, solver: SolverHost, *, period_ns: int, fixed: Effort | None = None) -> None:
@@ -31,16 +31,17 @@ class Aim:
 
         Args:
             viewer: Source of the predicted eyes.
-            solver: Source of the measured costs of solutions.
-            period_ns: Refresh period of the display.
-            fixed: Effort of every solution if `model.effort` is `full`. None means all steps on the full raster.
+            solver: Source of the measured solution costs.
+            period_ns: The display's refresh period.
+            fixed: Effort to use for every solution if `model.effort` is `full`. None means all steps on the full
+                raster.
         """
         self._viewer, self._solver, self._period_ns, self._fixed = viewer, solver, period_ns, fixed
         self._chooser = EffortChooser()
-        self._calm_ns: int | None = None  # time since which the head has been slower than CALM_M_S
-        self._expected: dict[int, float] = {}  # expected squared distance in m² to the true eyes, by requested instant
-        self._speed2 = 0.0  # running mean of the squared speed in (m/s)²
-        self._learned: int | None = None  # number of the newest solution whose measures have been used
+        self._calm_ns: int | None = None  # when the head's speed fell below CALM_M_S
+        self._expected: dict[int, float] = {}  # expected squared distance to the true eyes, m², by requested time
+        self._speed2 = 0.0  # running mean of the squared speed, in (m/s)²
+        self._learned: int | None = None  # number of the latest solution whose measures have been used
 
     def request(
         self,
@@ -52,15 +53,15 @@ class Aim:
         flat_wanted: bool,
         paused: bool,
     ) -> SolveRequest:
-        """Return the next request to the solver.
+        """Return the next solver request.
 
         Args:
-            timing: Predicted times of the present refresh.
-            eyes: Eyes at the display time of the present refresh.
-            shown: The newest solution.
-            state: State of the run.
+            timing: Predicted times for the current refresh.
+            eyes: Eyes at the current refresh's display time.
+            shown: The latest solution.
+            state: The run's state.
             flat_wanted: True if the flat picture is shown or will be needed soon.
-            paused: True if the operator paused the picture.
+            paused: True if the operator has paused the picture.
         """
         self._learn(shown, eyes)
         predictor, refined, costs = state.predictor, None, self._solver.costs
@@ -86,11 +87,11 @@ class Aim:
         self._expected[then_ns] = expected_m2
         while len(self._expected) > REQUESTS_KEPT:
             self._expected.pop(next(iter(self._expected)))
-        # The solution is aligned to newer eyes when it is shown, so only the uncertainty of the present eyes matters.
+        # When the solution is shown, it is aligned to newer eyes, so only the current eyes' uncertainty matters.
         return SolveRequest(then_ns, then_m, label, eyes.sigma_m, flat_wanted, paused, effort, refined)
 
     def _learn(self, shown: Solution | None, eyes: EyesEstimate) -> None:
-        """Update the statistics with the newest solution's measures and the motion of the eyes."""
+        """Update the statistics from the latest solution's measures and from how far the eyes have moved."""
         if shown is None or shown.solved_for_m is None:
             return
         expected_m2 = self._expected.get(shown.solved_for_ns, 0.0)
@@ -102,17 +103,17 @@ class Aim:
             self._chooser.pictures.learn(shown.measures, shown.effort)
 
     def _middle_ns(self, timing: FrameTiming, cost_ns: int) -> int:
-        """Return the middle of the time for which a solution that starts now will be shown.
+        """Return the middle of the interval during which a solution started now will be shown.
 
-        The solution is complete after `cost_ns`, appears half a period later on average, and is shown until the next
-        solution appears.
+        The solution is complete after `cost_ns`, appears half a period later on average, and stays on the panels until
+        the next one appears.
         """
         return timing.photon_ns + cost_ns + (self._period_ns + max(cost_ns, self._period_ns)) // 2
 
     def _eyes_then(self, timing: FrameTiming, eyes: EyesEstimate, *, cost_ns: int) -> tuple[int, F64 | None, EyesLabel]:
-        """Return the instant to solve for, and the predicted eyes (2, 3) with their label.
+        """Return the time to solve for, the eyes (2, 3) predicted for that time, and their label.
 
-        The prediction reaches no further than `HORIZON_NS` beyond the display time.
+        The eyes are predicted at most `HORIZON_NS` beyond the display time.
         """
         middle_ns = self._middle_ns(timing, cost_ns)
         reach_ns = min(middle_ns, timing.photon_ns + HORIZON_NS)
@@ -141,7 +142,7 @@ class Aim:
         return outlook
 
     def _horizon_s(self, timing: FrameTiming, *, speed_m_s: float) -> float:
-        """Return the time in seconds for which the head's motion is expected to continue.
+        """Return how long the head is expected to keep moving as it does now, in seconds.
 
         A calm head is expected to stay calm for as long as it has already been calm.
         """
@@ -153,9 +154,9 @@ class Aim:
         return max(HORIZON_S, (timing.photon_ns - self._calm_ns) / NS_PER_S)
 
     def _usual_speed_m_s(self, moved_m: float, eyes: EyesEstimate) -> float:
-        """Return the head's present speed or the RMS of its recent speed, whichever is larger.
+        """Return the head's current speed or the RMS of its recent speed, whichever is larger.
 
-        The RMS remains useful at turning points, where the present speed is zero, and while the eyes are lost.
+        The RMS is needed at turning points, where the current speed is zero, and while the eyes are lost.
         """
         speed_m_s = moved_m * NS_PER_S / self._period_ns
         if eyes.label != "held":
@@ -164,7 +165,7 @@ class Aim:
         return float(max(speed_m_s if eyes.label != "held" else 0.0, self._speed2**0.5))
 
     def _shown_error(self, eyes: EyesEstimate, shown: Solution | None, *, time_ns: int) -> float:
-        """Return the expected squared error of light of the newest solution at an instant."""
+        """Return the squared light error to expect from the latest solution at a given time."""
         pictures = self._chooser.pictures
         if shown is None or shown.effort is None or shown.solved_for_m is None or eyes.eyes_m is None:
             return pictures.contrast
@@ -174,14 +175,14 @@ class Aim:
     def _refined(
         self, shown: Solution, most: int, costs: Costs, *, shown_error: float, horizon_s: float
     ) -> Effort | None:
-        """Return the effort to which a resting head's solution is refined, or None to keep the solution.
+        """Return the effort to refine a resting head's solution to, or None to keep the solution as it is.
 
         Args:
             shown: The solution to refine.
-            most: Largest number of steps up to which the solution can be continued.
-            costs: Costs of solutions.
-            shown_error: Expected squared error of the solution that is shown.
-            horizon_s: Time for which the head is expected to stay at rest.
+            most: Largest total number of steps that the solution can be continued to.
+            costs: Solution costs.
+            shown_error: Squared error expected from the solution now shown.
+            horizon_s: How long the head is expected to stay at rest, in seconds.
         """
         done, pictures = shown.effort, self._chooser.pictures
         if done is None:

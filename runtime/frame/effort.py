@@ -1,21 +1,20 @@
-"""Choose the raster and the number of steps that minimize the expected error of each solution.
+"""Choose the raster and number of steps so that each solution has the least expected error.
 
-A solution that takes c seconds to compute stays on the panels for T = max(c, refresh period) and is computed for the
-eyes at the middle of this interval. The squared error of light at the true eyes, averaged over the interval, is the
-error Q for a still viewer plus the error D of an outdated view (docs/mathematics.md, "Effort"):
+A solution that takes c seconds to compute stays on the panels for T = max(c, refresh period), and is computed for the
+eye positions expected at the middle of this interval. Averaged over the interval, the squared error of the light at the
+true eyes is Q, the error for a still viewer, plus D, the error due to an outdated view (docs/mathematics.md, "Effort"):
 
     J = Q(raster, steps) + D(sqrt(2·sigma² + v²·T²/12 + l²), T/sqrt(12)),
     D(d, t) = y / (1 + y/D_max),    y = a·d²/(d + d0) + b·t²
 
-The symbol sigma is the tracking error per axis at the middle of the interval, v is the speed of the head, and l is the
-distance that the head moves beyond the tracker's prediction horizon. A common factor scales sigma, v and l to
-make predicted displacements match observed displacements. The rates a and b describe how the picture changes with the
-position of the head and with time. D_max is half the variance of the picture. The values of a, b and D_max are
-measured on successive target pictures.
+Here sigma is the tracking error along each axis at the middle of the interval, v is the head's speed, and l is how far
+the head moves beyond the tracker's prediction horizon. All three are multiplied by one factor that makes the predicted
+displacements match the observed ones. The rates a and b describe how fast the picture changes as the head moves and as
+time passes, and D_max is half the picture's variance. All of a, b and D_max are measured on successive target pictures.
 
-Until a solution is complete, the panels show the previous solution with the error E and do not respond to a head that
-starts moving. The mean error over a horizon H is (c·E + (H - c)·J) / H + D_max·(c/H)²/2. The chooser takes the effort
-with the lowest mean error, with a preference for the present effort and for faster efforts.
+Until a solution is complete, the panels show the previous one, with error E, and do not respond if the head starts
+moving. The mean error over a horizon H is (c·E + (H - c)·J) / H + D_max·(c/H)²/2. The effort with the lowest mean error
+is chosen, unless the current effort or a faster one is nearly as good.
 """
 
 from __future__ import annotations
@@ -26,38 +25,38 @@ from dataclasses import dataclass, field
 from runtime.records import Effort, Measures
 
 SOLVING_STAGES = ("render", "prepare", "inference", "finish", "step")
-HORIZON_S = 1.0  # time for which head and content are assumed to continue unchanged
-EQUAL = 1.03  # the fastest effort is chosen among efforts whose mean errors are within this factor of the lowest
-PREFERRED = 0.93  # share of the present effort's mean error below which another effort is chosen
-GAIN = 0.2  # weight of the newest measurement in a running mean
-KEPT_SOLUTIONS = 100  # times of a raster are discarded after this many solutions on other rasters
-# Squared error of light after k steps, relative to no steps: solver `best`, mean over the scenes demo and texture at
-# 960x540, tracking error 2 mm.
+HORIZON_S = 1.0  # how long head and content are assumed to continue as they are
+EQUAL = 1.03  # the fastest effort with a mean error at most this many times the lowest is chosen
+PREFERRED = 0.93  # another effort is chosen if its mean error is below this share of the current effort's
+GAIN = 0.2  # weight given to the latest measurement in a running mean
+KEPT_SOLUTIONS = 100  # a raster's times are discarded after this many solutions on other rasters
+# Squared light error after k steps, relative to no steps: `best` solver, mean over the demo and texture scenes at
+# 960x540, with a tracking error of 2 mm.
 STEP_SHARES = (1.0, 0.77, 0.61, 0.58, 0.53, 0.53, 0.51, 0.51, 0.51)
-FIRST_RESIDUAL = 1e-3  # initial value of the squared error of a solution without steps
+FIRST_RESIDUAL = 1e-3  # initial estimate of the squared error without any steps
 FIRST_DETAIL = {
     1: 0.0,
     2: 1.6e-3,
     3: 3.6e-3,
     4: 6e-3,
-}  # initial values of the squared error due to the detail lost on a coarse raster, by reduction
-FIRST_RATE = 0.5  # initial value of a, per metre, from the demo scene
-BLUR_M = 4e-3  # d0, beyond which outlines are displaced by more than their blur and the error grows linearly
-FIRST_CONTRAST = 0.03  # initial value of D_max
-FORESIGHT_GAIN = 1 / 60  # weight of the newest refresh in the running means of `Foresight`
+}  # initial estimates of the squared error due to detail lost on coarse rasters, keyed by reduction
+FIRST_RATE = 0.5  # initial estimate of a, per metre, from the demo scene
+BLUR_M = 4e-3  # d0; farther away, outlines are displaced by more than their blur and the error grows linearly
+FIRST_CONTRAST = 0.03  # initial estimate of D_max
+FORESIGHT_GAIN = 1 / 60  # weight given to the latest refresh in the running means kept by `Foresight`
 LEAST_SCALE, MOST_SCALE = 0.02, 4.0
-TAIL = 0.02  # slope in y that remains at saturation, which makes a smaller distance always better
-SCALE_M, SCALE_S = 5e-3, 0.1  # units of displacement and time in the fit of the rates
+TAIL = 0.02  # slope with respect to y left at saturation, so that a smaller distance is always better
+SCALE_M, SCALE_S = 5e-3, 0.1  # units of displacement and time used in fitting the rates
 
 
 @dataclass(frozen=True, slots=True)
 class Costs:
-    """Times that solutions take on this machine and with this scene, in milliseconds."""
+    """Time taken by each kind of solution on this machine with this scene, in milliseconds."""
 
-    stages: Mapping[int, Mapping[str, float]]  # by reduction and stage in SOLVING_STAGES; `step` is for a single step
+    stages: Mapping[int, Mapping[str, float]]  # keyed by reduction, then stage in SOLVING_STAGES; `step`: one step
 
     def ms(self, effort: Effort) -> float:
-        """Return the time in milliseconds that a solution takes from its start to complete layers."""
+        """Return how long a solution takes from start to complete layers, in milliseconds."""
         stages = self.stages[effort.reduction]
         steps = effort.steps - (effort.continued_from or 0)
         begun = ("finish",) if effort.continued_from is not None else ("render", "prepare", "inference", "finish")
@@ -65,34 +64,35 @@ class Costs:
 
 
 def simulated_costs(stage_ms: Mapping[str, float], reductions: Iterable[int]) -> Costs:
-    """Scale the configured costs of the full raster by the number of pixels on each raster.
+    """Derive the costs on each raster by scaling those configured for the full raster by pixel count.
 
     Args:
-        stage_ms: Milliseconds by stage on the full raster (`loop.simulated_stage_ms`).
-        reductions: Divisors of the rows and columns of the panels.
+        stage_ms: Time of each stage on the full raster, in milliseconds (`loop.simulated_stage_ms`).
+        reductions: Numbers by which the panels' rows and columns are divided, one for each raster.
     """
     return Costs({by: {stage: stage_ms.get(stage, 0.0) / by**2 for stage in SOLVING_STAGES} for by in reductions})
 
 
 class CostBook:
-    """Keeps running means of the stage times on each raster.
+    """Keeps running means of each raster's stage times.
 
-    The times of a raster that has not been used for `KEPT_SOLUTIONS` solutions are discarded, because the load of the
+    If a raster has not been used for `KEPT_SOLUTIONS` solutions, its times are discarded, because the load on the
     machine may have changed.
     """
 
     def __init__(self, first: Mapping[int, Mapping[str, float]]) -> None:
-        """Create a book of costs with initial times.
+        """Create a cost book with initial times.
 
         Args:
-            first: Milliseconds by reduction and stage, measured with full pictures before the first refresh.
+            first: Time in milliseconds, keyed by reduction and then stage, measured with full pictures before the first
+                refresh.
         """
         self.first = first
         self._measured: dict[int, dict[str, float]] = {}
-        self._unused: dict[int, int] = {}  # number of solutions on other rasters since the last use, by reduction
+        self._unused: dict[int, int] = {}  # solutions on other rasters since this one's last use, by reduction
 
     def learn(self, effort: Effort, stage_ms: Mapping[str, float]) -> None:
-        """Update the means with the stage times of one solution, in milliseconds."""
+        """Update the means with one solution's stage times, in milliseconds."""
         self._unused = {by: count + 1 for by, count in self._unused.items()} | {effort.reduction: 0}
         self._measured = {by: means for by, means in self._measured.items() if self._unused[by] < KEPT_SOLUTIONS}
         means = self._measured.setdefault(effort.reduction, {})
@@ -106,11 +106,12 @@ class CostBook:
             means[stage] = means.get(stage, spent_ms) + GAIN * (spent_ms - means.get(stage, spent_ms))
 
     def costs(self) -> Costs:
-        """Return the present costs of solutions on every raster.
+        """Return the current solution costs on every raster.
 
-        Rasters that have not been measured recently get their initial times, scaled by the ratio of recent times to
-        initial times on the measured rasters. Their cost is limited to the cost of the next finer raster divided by the
-        ratio of the raster widths. The limit keeps a raster eligible if other work delayed its initial measurement.
+        If a raster has not been measured recently, its initial times are used, scaled by the ratio of recent to initial
+        times on the measured rasters. They are limited to the times on the next finer raster, divided by the ratio of
+        the two raster widths. Without this limit, a raster might never be chosen again if other work had slowed down
+        its initial measurement.
         """
         measured_ms = sum(sum(stages.values()) for stages in self._measured.values())
         first_ms = sum(self.first.get(by, {}).get(s, 0.0) for by, stages in self._measured.items() for s in stages)
@@ -129,26 +130,26 @@ class CostBook:
 
 @dataclass(frozen=True, slots=True)
 class Outlook:
-    """Accuracy with which the tracker can predict the eyes for a solution, for one effort."""
+    """Expected accuracy of the eyes predicted for a solution, which depends on the solution's effort."""
 
-    sigma_m: float = 0.0  # standard deviation per axis of the predicted midpoint of the eyes
-    speed_m_s: float = 0.0  # speed of the head
-    lag_m: float = 0.0  # distance that the head moves beyond the tracker's prediction horizon
+    sigma_m: float = 0.0  # standard deviation of the predicted midpoint of the eyes along each axis
+    speed_m_s: float = 0.0  # the head's speed
+    lag_m: float = 0.0  # how far the head moves beyond the tracker's prediction horizon
 
     def moved_m2(self, life_s: float) -> float:
-        """Return the mean squared distance in m² from a solution's eyes to the true eyes.
+        """Return the mean squared distance from a solution's eyes to the true eyes, in m².
 
         Args:
-            life_s: Time for which the solution is shown.
+            life_s: How long the solution is shown, in seconds.
         """
         return 2 * self.sigma_m**2 + (self.speed_m_s * life_s) ** 2 / 12 + self.lag_m**2
 
 
 @dataclass(slots=True)
 class Foresight:
-    """Estimates the ratio of observed to expected squared distances that the eyes move.
+    """Estimates the ratio of observed to expected squared eye displacement.
 
-    The distances are from the eyes that a solution was computed for to the true eyes while the solution is shown.
+    A displacement is the distance from the eyes that a solution was computed for to the true eyes while it is shown.
     """
 
     scale: float = 1.0
@@ -156,7 +157,7 @@ class Foresight:
     _found: float = 0.0
 
     def learn(self, *, expected_m2: float, found_m2: float) -> None:
-        """Update the ratio with one refresh."""
+        """Update the ratio with the distances found at one refresh."""
         self._expected += FORESIGHT_GAIN * (expected_m2 - self._expected)
         self._found += FORESIGHT_GAIN * (found_m2 - self._found)
         if self._expected > 0.0:
@@ -165,17 +166,17 @@ class Foresight:
 
 @dataclass(slots=True)
 class PictureStatistics:
-    """Estimates the errors of solutions and the rates at which their pictures change, from measurements."""
+    """Estimates solution errors and how fast the pictures change, based on measurements."""
 
-    residual: float = FIRST_RESIDUAL  # squared error of a solution without steps, on the solution's raster
-    detail: dict[int, float] = field(default_factory=lambda: dict(FIRST_DETAIL))  # error of lost detail, by reduction
+    residual: float = FIRST_RESIDUAL  # squared error on the solution's raster without any steps
+    detail: dict[int, float] = field(default_factory=lambda: dict(FIRST_DETAIL))  # error from lost detail, by reduction
     rate_m: float = FIRST_RATE  # a, per metre
     rate_s2: float = 0.0  # b, per square second
     contrast: float = FIRST_CONTRAST  # D_max
     _measured: bool = False
 
     def learn(self, measures: Measures, effort: Effort) -> None:
-        """Update the estimates with the measures of one solution."""
+        """Update the estimates with one solution's measures."""
         gain = GAIN if self._measured else 1.0
         if measures.residual is not None:
             residual = measures.residual / step_share(effort.steps)
@@ -189,16 +190,16 @@ class PictureStatistics:
             self._learn_change(*measures.change)
 
     def stale(self, distance_m: float, elapsed_s: float) -> float:
-        """Return D, the squared error of a picture drawn `elapsed_s` earlier and `distance_m` away."""
+        """Return D, the squared error of a picture drawn `elapsed_s` earlier, for eyes `distance_m` away."""
         y = self.rate_m * _outlines_off_m(distance_m) + self.rate_s2 * elapsed_s**2
         return y / (1 + y / self.contrast) + TAIL * y
 
     def own(self, effort: Effort) -> float:
-        """Return Q, the squared error at the eyes that a solution was computed for."""
+        """Return Q, a solution's squared error at the eyes that it was computed for."""
         return self.detail.get(effort.reduction, 0.0) + self.residual * step_share(effort.steps)
 
     def _learn_change(self, changed: float, distance_m: float, elapsed_s: float) -> None:
-        """Fit a and b of y = a·d²/(d + d0) + b·t² by normalised least mean squares."""
+        """Fit a and b in y = a·d²/(d + d0) + b·t² by normalised least mean squares."""
         y = changed / max(1 - changed / self.contrast, 0.1)
         off, t2 = _outlines_off_m(distance_m) / SCALE_M, (elapsed_s / SCALE_S) ** 2
         a, b = self.rate_m * SCALE_M, self.rate_s2 * SCALE_S**2
@@ -212,18 +213,18 @@ def _outlines_off_m(distance_m: float) -> float:
 
 
 def step_share(steps: int) -> float:
-    """Return the squared error after `steps` steps, relative to the squared error without steps."""
+    """Return the squared error after this many steps, relative to the squared error without any."""
     return STEP_SHARES[min(steps, len(STEP_SHARES) - 1)]
 
 
 def candidates(reductions: tuple[int, ...], steps: int) -> list[Effort]:
-    """List the efforts to choose from, which are 0, 1, 2, 4 and `steps` steps on every raster."""
+    """List the efforts to choose from: 0, 1, 2, 4 and `steps` steps on every raster."""
     counts = sorted({count for count in (0, 1, 2, 4, steps) if count <= steps})
     return [Effort(reduction, count) for reduction in reductions for count in counts]
 
 
 class EffortChooser:
-    """Chooses the effort of the next solution from measured statistics and the previous choice."""
+    """Chooses the next solution's effort, based on measured statistics and the previous choice."""
 
     def __init__(self) -> None:
         self.pictures, self.foresight = PictureStatistics(), Foresight()
@@ -243,11 +244,11 @@ class EffortChooser:
 
         Args:
             efforts: Efforts to choose from.
-            costs: Costs of solutions.
-            outlook: Function that maps the cost of a solution in milliseconds to its outlook.
-            shown_error: Expected squared error of the solution that is shown at present.
-            period_ms: Refresh period of the display.
-            horizon_s: Time for which head and content are assumed to continue unchanged.
+            costs: Solution costs.
+            outlook: Function that maps a solution's cost in milliseconds to its outlook.
+            shown_error: Squared error expected from the solution now shown.
+            period_ms: The display's refresh period.
+            horizon_s: How long head and content are assumed to continue as they are, in seconds.
         """
         means: dict[Effort, float] = {}
         for effort in efforts:
@@ -262,17 +263,17 @@ class EffortChooser:
         return best
 
     def mean_error(self, error: float, cost_ms: float, *, shown_error: float, horizon_s: float) -> float:
-        """Return the mean error over the horizon if a solution is started now.
+        """Return the mean error over the horizon for a solution started now.
 
-        The error is `shown_error` until the solution is complete and `error` afterwards. A head that starts to move
-        before the solution is complete sees an outdated view until then. This case has the probability c/H and lasts
-        c/2 on average.
+        The error is `shown_error` until the solution is complete, and `error` after that. If the head starts moving
+        before the solution is complete, the viewer sees an outdated view until then. The probability of this is c/H,
+        and it lasts c/2 on average.
         """
         waited = min(cost_ms / 1e3 / horizon_s, 0.9)
         return waited * shown_error + (1 - waited) * error + waited**2 / 2 * self.pictures.contrast
 
     def expected_error(self, effort: Effort, outlook: Outlook, *, life_s: float) -> float:
-        """Return J, the mean squared error of light while a solution is shown for `life_s` seconds."""
+        """Return J, the mean squared light error while a solution is shown for `life_s` seconds."""
         spread_s = life_s / 12**0.5
         moved_m = (self.foresight.scale * outlook.moved_m2(life_s)) ** 0.5
         return self.pictures.own(effort) + self.pictures.stale(moved_m, spread_s)

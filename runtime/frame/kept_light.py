@@ -1,4 +1,4 @@
-"""Save the layers and the target pictures of every N-th refresh to files (`--keep-light`)."""
+"""Save every N-th refresh's layers and target pictures to files (`--keep-light`)."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from runtime.support.background import MEASURING_NICENESS, BackgroundJob
 log = logging.getLogger("phasestack.light")
 
 LOOK_S = 0.1  # interval between checks for a stop request
-WRITTEN_WITHIN_S = 10.0  # timeout for writing the last refresh's layers
+WRITTEN_WITHIN_S = 10.0  # timeout for writing the layers of the last saved refresh
 
 
 class Output(Protocol):
-    """Destination for the files that a run writes."""
+    """Destination for a run's output files."""
 
     def refresh(self, line: dict[str, Any]) -> None:
         """Append a line to frames.jsonl."""
 
     def light(self, frame: int, *, layers: U8) -> None:
-        """Write the layers that the panels showed at a refresh.
+        """Write the layers shown by the panels at one refresh.
 
         Args:
             frame: Refresh number.
@@ -38,13 +38,13 @@ class Output(Protocol):
         """
 
     def light_targets(self, frame: int, *, info: dict[str, Any], drawn: Pictures | None, true: Pictures | None) -> None:
-        """Write the target pictures of a refresh whose layers were saved.
+        """Write the target pictures for a refresh whose layers were saved.
 
         Args:
             frame: Refresh number.
-            info: Eye positions and field of view of the pictures.
-            drawn: Pictures for the eyes that the solution was computed for.
-            true: Pictures for the true eyes.
+            info: Eye positions, and the pictures' field of view.
+            drawn: Pictures for the eye positions used to compute the solution.
+            true: Pictures for the true eye positions.
         """
 
 
@@ -52,13 +52,13 @@ class Output(Protocol):
 class _Kept:
     account: RefreshAccount
     solved_for_ns: int
-    content: object | None  # content of the run at this refresh
+    content: object | None  # the run's content at this refresh
 
 
 class KeptLight:
-    """Writes the layers and the target pictures of every `every`-th refresh.
+    """Writes every `every`-th refresh's layers and target pictures.
 
-    Nothing is written if `every` is 0.
+    If `every` is 0, nothing is written.
     """
 
     def __init__(self, every: int, output: Output, drawer: TargetDrawer, truth: TrueEyes, *, simulated: bool) -> None:
@@ -68,9 +68,10 @@ class KeptLight:
         self._kept: list[_Kept] = []
 
     def refreshed(self, refresh: Refresh) -> None:
-        """Write the layers of this refresh if it is due.
+        """Write this refresh's layers if it is due.
 
-        In real time, a background job writes the layers. A refresh that is due while the job is running is skipped.
+        In real time, a background job writes the layers, and any refresh that comes due while the job is still running
+        is skipped.
         """
         account = refresh.account
         if not self._every or account.frame % self._every != self._every - 1 or not account.presented:
@@ -89,15 +90,15 @@ class KeptLight:
         kept = _Kept(account, solved_for_ns, self._drawer.shown_content())
         if self._truth.is_recorded:
             self._kept.append(kept)
-        else:  # a live run ends on a signal, which leaves no time to draw afterwards
+        else:  # a live run is ended by a signal, so there is no time to draw afterwards
             self._draw(kept, lambda: None)
 
     def finish(self, stopped: Callable[[], bool]) -> None:
-        """Draw the target pictures of the saved refreshes of a recording.
+        """When playing a recording, draw the target pictures for all saved refreshes.
 
         Args:
-            stopped: Function that returns True after a stop request. The remaining refreshes are then written without
-                target pictures.
+            stopped: Function that returns True once a stop has been requested. The remaining refreshes are then written
+                without target pictures.
         """
         if self._job is not None:
             self._job.wait(WRITTEN_WITHIN_S)

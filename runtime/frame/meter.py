@@ -1,6 +1,6 @@
-"""Measure the error, the lost detail and the rate of change of solutions on a sample of their pixels.
+"""Measure each solution's error, lost detail and rate of change on a sample of its pixels.
 
-The measurements run on the solver's thread.
+All measurements run on the solver's thread.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from runtime.records import F32, F64, U8, Effort, Measures
 from runtime.support.gl import DrawnPicture
 
 RAYS = 1024  # rays per eye
-SAMPLED = 54, 96  # rows and columns of the grid on which successive pictures are compared
-BAND_ROWS = 64  # height of each of the two bands in which lost detail is measured
-EVERY = 4  # residual and detail are measured for every 4th solution of an effort, change for every 4th solution
+SAMPLED = 54, 96  # rows and columns of the grid used to compare successive pictures
+BAND_ROWS = 64  # height of each of the two bands used to measure lost detail
+EVERY = 4  # measure residual and detail on every 4th solution with the same effort, and change on every 4th of all
 
 
 class SolutionMeter:
-    """Measures the errors of solutions and the change between the pictures of successive solutions."""
+    """Measures each solution's errors and how much its pictures differ from the previous solution's."""
 
     def __init__(self) -> None:
         self._before: tuple[tuple[int, ...], list[U8], Job, int] | None = None  # raster and window, pictures, job, time
@@ -35,13 +35,13 @@ class SolutionMeter:
         self._places = np.random.default_rng(1).random((2, RAYS, 2))
 
     def measure(self, job: Job, layers: U8, effort: Effort, *, time_ns: int) -> Measures | None:
-        """Measure one solution, or return None if its pictures exist only as textures.
+        """Measure one solution. Returns None if its pictures exist only as textures.
 
         Args:
-            job: Job that was solved.
-            layers: (N, h, w, 4) layers of the solution.
-            effort: Effort of the solution.
-            time_ns: Instant for which the pictures were drawn.
+            job: The job that was solved.
+            layers: The solution's layers, shape (N, h, w, 4).
+            effort: The solution's effort.
+            time_ns: Time that the pictures were drawn for.
         """
         if any(isinstance(view.picture, DrawnPicture) for view in job.views):
             return None
@@ -62,7 +62,7 @@ class SolutionMeter:
     def _change(self, job: Job, *, time_ns: int) -> tuple[float, float, float] | None:
         """Return `Measures.change`, or None if the change is not measured for this solution.
 
-        The pictures of one solution in `EVERY` are copied and compared with the pictures of the next solution.
+        Of every `EVERY` solutions, one has its pictures copied and compared with the next solution's pictures.
         """
         turn, self._solutions = self._solutions % EVERY, self._solutions + 1
         before, self._before = self._before, None
@@ -85,18 +85,20 @@ class SolutionMeter:
 
 
 def sampled_light(layers: U8, job: Job, places: F64, *, boxes: bool) -> float | None:
-    """Return the squared error of light at sampled pixels of the two pictures.
+    """Return the squared error of the light, measured at sampled pixels in both pictures.
 
-    Two rays are traced through each sampled pixel. The mean product of their errors is unbiased because the two rays
-    fall into the same pixel (docs/contracts.md: light). Pairs with a ray that misses a panel are ignored. If no pair is
-    left, the result is None.
+    Two rays are traced through each sampled pixel, and their errors are multiplied. Because both rays go through the
+    same pixel, the mean of these products is unbiased (docs/contracts.md: light). A pair is ignored if either ray
+    misses a panel. Returns None if no pair is left.
 
     Args:
-        layers: (N, h, w, 4) layers on the raster of the job.
-        job: Job that was solved.
-        places: (2, K, 2) uniform random numbers in [0, 1). `places[0]` selects the K pixels by fractions of the width
-            and height of the picture. The remainders modulo 1/64 determine where the two rays lie within their pixel.
-        boxes: True to treat panel pixels as uniform squares. False for a coarse solution, which is enlarged bilinearly.
+        layers: Layers on the job's raster, shape (N, h, w, 4).
+        job: The job that was solved.
+        places: Uniform random numbers in [0, 1), shape (2, K, 2). `places[0]` selects the K pixels, as fractions of the
+            picture's width and height. The remainders of all numbers modulo 1/64 determine where the two rays lie
+            within their pixel.
+        boxes: True to treat each panel pixel as a uniform square. False for a coarse solution, which is enlarged
+            bilinearly.
     """
     stack, middle = job.stack, job.stack.count // 2
     rasters = [stack.panel(n) for n in range(stack.count)]
@@ -106,7 +108,7 @@ def sampled_light(layers: U8, job: Job, places: F64, *, boxes: bool) -> float | 
         middle_from_picture = rasters[middle].raster_from_plane() @ view.plane_from_picture
         column, row = (places[0] * (width, height)).astype(int).T
         target = view.pixels[row, column, :3] / np.float32(255)
-        offset = (places % (1 / 64) * 64).reshape(-1, 2).T  # position within the pixel, independent of the chosen pixel
+        offset = (places % (1 / 64) * 64).reshape(-1, 2).T  # position within the pixel, whichever was chosen
         at = middle_from_picture @ np.stack([*(np.tile((column, row), 2) + offset), np.ones(2 * len(row))])
         total, counts = np.zeros((2 * len(row), 3), np.float32), np.ones(2 * len(row), bool)
         for n in range(stack.count):
@@ -120,7 +122,7 @@ def sampled_light(layers: U8, job: Job, places: F64, *, boxes: bool) -> float | 
 
 
 def lost_detail(picture: U8) -> Mapping[int, float]:
-    """Return the squared error of reducing and enlarging a picture (h, w, 3 or 4), by reduction."""
+    """Return the squared error due to reducing and re-enlarging a picture (h, w, 3 or 4), by reduction."""
     height = picture.shape[0]
     bands = [picture[first : first + BAND_ROWS, :, :3] for first in (height // 3, 2 * height // 3)]
     return {
@@ -138,7 +140,7 @@ def _lost(band: U8, reduction: int) -> float:
 
 
 def _halved(picture: U8) -> U8:
-    """Average blocks of 2 x 2 pixels to reduce the effect of interpolation on the comparison."""
+    """Average blocks of 2 x 2 pixels, so that interpolation affects the comparison less."""
     height, width = picture.shape[:2]
     if min(height, width) < 2:
         return picture.copy()
@@ -147,7 +149,7 @@ def _halved(picture: U8) -> U8:
 
 
 def _grid(picture: U8) -> F32:
-    """Sample a picture on the coarse grid `SAMPLED`, and return (rows, columns, 3) values in 0..1."""
+    """Sample a picture on the coarse `SAMPLED` grid. Returns values in 0..1, shape (rows, columns, 3)."""
     rows, columns = _grid_lines(picture)
     return np.asarray(picture[rows][:, columns, :3] / np.float32(255), np.float32)
 
@@ -158,12 +160,12 @@ def _grid_lines(picture: U8) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def _moved_grid(pictures: Sequence[U8], job: Job, eyes_m: F64) -> list[F32]:
-    """Sample a job's pictures on the coarse grid, as the panels would show them to moved eyes.
+    """Sample a job's pictures on the coarse grid, as the panels would show them once the eyes have moved.
 
     Args:
-        pictures: Pictures of the job at half size, from `_halved`.
-        job: Job that was solved.
-        eyes_m: (2, 3) eyes after the motion.
+        pictures: The job's pictures at half size, from `_halved`.
+        job: The job that was solved.
+        eyes_m: Eyes after the movement, shape (2, 3).
     """
     middle = job.stack.count // 2
     moved = displacement(
@@ -181,16 +183,16 @@ def _moved_grid(pictures: Sequence[U8], job: Job, eyes_m: F64) -> list[F32]:
 
 
 def _sampled(layer: U8, x: F64, y: F64, *, boxes: bool) -> tuple[F32, NDArray[np.bool_]]:
-    """Sample a layer at K continuous pixel positions.
+    """Sample a layer at K positions given in fractional pixels.
 
     Args:
-        layer: (h, w, 4) layer.
-        x: (K,) columns.
-        y: (K,) rows.
-        boxes: True to treat pixels as uniform squares. False to interpolate bilinearly, clamped at the edge.
+        layer: Layer of shape (h, w, 4).
+        x: Columns, shape (K,).
+        y: Rows, shape (K,).
+        boxes: True to treat each pixel as a uniform square. False to interpolate bilinearly, clamped at the edge.
 
     Returns:
-        Colours (K, 3) in 0..255, and a mask (K,) that is True for positions inside the layer.
+        Colours (K, 3) in 0..255, and a mask (K,) that is True for each position inside the layer.
     """
     height, width = layer.shape[:2]
     inside = (x >= 0) & (x <= width) & (y >= 0) & (y <= height)

@@ -1,4 +1,4 @@
-"""Pass each refresh on to the writers of its line and its layers and to the quality sampler."""
+"""Pass each refresh on to the quality sampler and to the writers of frames.jsonl and of saved layers."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from runtime.records import RefreshAccount, SensorFrame
 
 
 class RunObserver:
-    """Records and measures the refreshes of one run.
+    """Records and measures a run's refreshes.
 
-    The presenter passes every sample and refresh to the observer. `finish` completes the records after the run.
+    The presenter passes on every sample and refresh. After the run, `finish` completes the records.
     """
 
     def __init__(
@@ -36,13 +36,13 @@ class RunObserver:
         """Create an observer for one run.
 
         Args:
-            stack: Panels of the display.
-            drawer: Drawer of target pictures.
-            evaluate_every: Measure the quality of every N-th refresh and the last refresh. If 0, measure only the last
-                refresh. If None, measure nothing.
-            keep_light: Save the layers of every N-th refresh. If 0, save no layers.
-            output: Destination for the files of the run. If None, no files are written.
-            on_account: Function that is called with the account of every refresh.
+            stack: The display's panels.
+            drawer: Draws the target pictures.
+            evaluate_every: Measure the quality of every `evaluate_every`-th refresh and of the last one. If 0, measure
+                only the last refresh. If None, measure nothing.
+            keep_light: Save the layers of every `keep_light`-th refresh. If 0, save no layers.
+            output: Destination for the run's files. If None, no files are written.
+            on_account: Function called with each refresh's account.
             simulated: True if the run's clock is simulated.
         """
         self._measures, self._simulated, self._on_account = evaluate_every is not None, simulated, on_account
@@ -54,21 +54,21 @@ class RunObserver:
 
     @property
     def moment(self) -> Moment | None:
-        """Newest refresh whose quality was measured."""
+        """The latest refresh whose quality was measured."""
         return self._sampler.moment
 
     @property
     def measured(self) -> dict[str, list[float]]:
-        """Quality figures of the sampled refreshes, by name."""
+        """Quality figures for the sampled refreshes, keyed by name."""
         return self._sampler.measured
 
     @property
     def live_errors(self) -> dict[int, float]:
-        """Mean squared errors of light at the true eyes, by refresh number."""
+        """Mean squared error of the light reaching the true eyes, keyed by refresh number."""
         return self._sampler.live
 
     def measure_only_live(self) -> None:
-        """Measure only live quality from now on, which takes a sixth of the time."""
+        """From now on, measure only live quality, which takes a sixth of the time."""
         self._sampler.only_live = True
 
     def sampled(self, sample: SensorFrame) -> None:
@@ -87,13 +87,13 @@ class RunObserver:
         self._sampler.advance()
 
     def finish(self, stopped: Callable[[], bool] = lambda: False) -> None:
-        """Complete the records of the run after its last refresh.
+        """Complete the run's records after its last refresh.
 
-        Queued refreshes are written and measured, and target pictures are drawn for the refreshes whose layers were
+        All queued refreshes are written and measured, and target pictures are drawn for each refresh whose layers were
         saved. The last refresh is also measured, but in real time only if no other refresh has been measured.
 
         Args:
-            stopped: Function that returns True after a stop request. The remaining work is then skipped.
+            stopped: Function that returns True once a stop has been requested. Any remaining work is then skipped.
         """
         self.truth.end()
         self._lines.advance()
@@ -106,9 +106,9 @@ class RunObserver:
                 self._sampler.finish(last)
 
     def live(self) -> dict[str, Any]:
-        """Return the live figures measured so far, for the daemon's status (docs/contracts.md, Error)."""
+        """Return the live quality measured so far, for the daemon's status (docs/contracts.md, Error)."""
         return {"live_db": self._sampler.live_db, "view_error_mm": self._lines.view_error_mm.of("p50", "p95")}
 
     def summary(self) -> dict[str, Any]:
-        """Return the part of summary.json with quality figures. Figures that were not measured are null."""
+        """Return the quality figures for summary.json. Any figure that was not measured is null."""
         return {**self.live(), **self._sampler.summary()}

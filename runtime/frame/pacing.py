@@ -1,8 +1,8 @@
-"""Predict the wake, present and display times of refreshes from vertical blanks.
+"""Predict when each refresh should wake, present and be displayed, based on vertical blanks.
 
-The module never reads a clock. Its callers pass in all times and events. The scheme follows the compositor pacing of
-Monado: it predicts the times of a refresh, receives the actual times, and learns the phase of the vertical blanks and
-the time that a refresh needs before a blank.
+This module never reads a clock: the caller passes in all times and events. The method follows Monado's compositor
+pacing: predict a refresh's times, take in the actual times, and learn from them the phase of the vertical blanks and
+how long a refresh needs before a blank.
 """
 
 from __future__ import annotations
@@ -10,18 +10,18 @@ from __future__ import annotations
 from runtime.clock import NS_PER_MS
 from runtime.records import FrameTiming
 
-PHASE_GAIN = 0.1  # share of the prediction error of the newest blank by which the phase is corrected
-WORK_GAIN = 0.05  # gain of decreases of the estimated work time (increases have gain 0.5)
-LATE_SHARE = 0.5  # a refresh that is late by more than this share of a period moves to the next slot
-MARGIN_GROWTH = 1.5  # factor on the margin after a missed blank
-MARGIN_DECAY = 0.9995  # factor on the margin after a met blank; one blank in 800 is missed if MARGIN_MIN_NS is too low
+PHASE_GAIN = 0.1  # share of the latest blank's prediction error used to correct the phase
+WORK_GAIN = 0.05  # gain for decreases of the estimated work time (0.5 for increases)
+LATE_SHARE = 0.5  # a refresh late by more than this share of a period is moved to the next slot
+MARGIN_GROWTH = 1.5  # the margin is multiplied by this after a missed blank
+MARGIN_DECAY = 0.9995  # and by this after a met blank: one blank in 800 is missed if MARGIN_MIN_NS is too low
 MARGIN_MIN_NS = NS_PER_MS
 
 
 class Pacer:
-    """Schedules refreshes in slots that are one refresh period apart.
+    """Schedules refreshes in slots spaced one refresh period apart.
 
-    Slots that cannot be met count as missed. A refresh that is skipped on purpose, because the picture has not changed,
+    Each slot that cannot be met counts as missed. A refresh skipped on purpose because the picture has not changed
     keeps its slot and does not count as missed.
     """
 
@@ -29,9 +29,9 @@ class Pacer:
         """Create a pacer for a display.
 
         Args:
-            period_ns: Refresh period of the display.
-            photon_ns: Time from presenting to the middle of the display time.
-            work_ns: Initial estimate of the time from waking to presenting.
+            period_ns: The display's refresh period.
+            photon_ns: Time from presenting a refresh to the middle of its time on the display.
+            work_ns: Initial estimate of the time needed from waking to presenting.
 
         Raises:
             ValueError: The period is not positive.
@@ -42,7 +42,7 @@ class Pacer:
         self._work_ns = float(work_ns)
         self._margin_ns = float(MARGIN_MIN_NS)
         self._has_blanks = False
-        self._target_ns: int | None = None  # target of the last refresh
+        self._target_ns: int | None = None  # planned present time of the latest refresh
         self._number = -1
         self.missed = 0
 
@@ -63,18 +63,18 @@ class Pacer:
         return FrameTiming(self._number, target_ns - lead_ns, target_ns, target_ns + self._photon_ns)
 
     def presented(self, timing: FrameTiming, *, woke_ns: int, done_ns: int, blank_ns: int | None = None) -> int:
-        """Record the outcome of a refresh, and return the best estimate of its display time.
+        """Record what happened to a refresh, and return the best estimate of its display time.
 
         Args:
-            timing: Predicted times of the refresh.
-            woke_ns: Time at which the refresh woke.
-            done_ns: Time at which presenting was done.
-            blank_ns: Time of the vertical blank of the refresh. None if the display driver does not report the blank or
-                skipped the swap.
+            timing: The refresh's predicted times.
+            woke_ns: When the refresh woke.
+            done_ns: When presenting was done.
+            blank_ns: Time of the vertical blank at which the refresh appeared. None if the display driver does not
+                report blanks or skipped the swap.
         """
         if blank_ns is None:
             self._learn_work(done_ns - woke_ns)
-            # If blanks are known, a skipped swap keeps the old picture on screen until the slot of the refresh.
+            # If blanks are known, the swap was skipped: the old picture stays on screen, and is on time in its slot.
             return (timing.present_ns if self._has_blanks else done_ns) + self._photon_ns
         self._has_blanks = True
         error_ns = blank_ns - timing.present_ns
@@ -90,11 +90,11 @@ class Pacer:
         return blank_ns + self._photon_ns
 
     def _lead_ns(self) -> int:
-        """Return the time in nanoseconds to allow between waking and presenting."""
+        """Return how much time to allow between waking and presenting, in nanoseconds."""
         return round(self._work_ns + (self._margin_ns if self._has_blanks else 0.0))
 
     def _learn_work(self, work_ns: int) -> None:
-        # A gain below 1 for increases limits how early later refreshes wake after a single long refresh.
+        # The gain for increases is also below 1, so that one long refresh does not make later ones wake far too early.
         gain = 0.5 if work_ns > self._work_ns else WORK_GAIN
         bounded = min(work_ns, self.period_ns // 2)
         self._work_ns += gain * (bounded - self._work_ns)

@@ -1,8 +1,8 @@
-"""Decide whether the solver computes a solution, draws the flat picture or does nothing.
+"""Decide whether the solver should compute a solution, draw the flat picture or do nothing.
 
-The module uses no clock and no I/O. Whether a head is at rest is decided only by the rest watch (`eyes.rest`), which
-receives the samples of the sensor. Eyes labelled `rested` are solved for once. Any other change of the eyes requires a
-new solution.
+This module uses no clock and does no I/O. Only the rest watch (`eyes.rest`), which receives the sensor's samples,
+decides whether a head is at rest. Eyes labelled `rested` are solved for only once. Otherwise, whenever the eyes change
+at all, a new solution is computed.
 """
 
 from __future__ import annotations
@@ -14,38 +14,38 @@ from runtime.clock import NS_PER_S
 from runtime.plan.savings import Plan, selected_eyes
 from runtime.records import F64, Effort, EyesEstimate, SolveRequest
 
-BLEND_S = 0.3  # duration of the blend to or from the flat picture
+BLEND_S = 0.3  # duration of a blend to or from the flat picture
 
 Kind = Literal["solve", "refine", "flat", "nothing"]
 
 
 @dataclass(frozen=True, slots=True)
 class SolutionKey:
-    """Inputs of the newest solution or flat picture.
+    """The inputs used for the latest solution or flat picture.
 
-    A result is outdated if the present inputs differ from the inputs in its key.
+    The result is outdated if the current inputs differ from those in its key.
     """
 
     state_version: int
-    revision: int  # revision of the content
-    eyes_m: F64 | None  # (2, 3) eyes that the solution is for; None for a flat picture
-    effort: Effort | None = None  # effort of the solution
-    episode: int = 0  # number of the flat episode, during which the viewpoint of the flat picture does not change
+    revision: int  # content revision
+    eyes_m: F64 | None  # (2, 3) eyes that the solution was computed for; None for a flat picture
+    effort: Effort | None = None  # effort spent on the solution
+    episode: int = 0  # number of the flat episode; during an episode, the flat picture's viewpoint does not change
 
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """Next action of the solver."""
+    """The solver's next action."""
 
     kind: Kind
     eyes_m: F64 | None = None  # (2, 3) eyes to solve for
 
 
 class FramePolicy:
-    """Decides the solver's next action from a request and the keys of the existing pictures."""
+    """Decides the solver's next action, given a request and the keys of the existing pictures."""
 
     def __init__(self) -> None:
-        self.episode = 0  # number of the current or last flat episode
+        self.episode = 0  # number of the current or latest flat episode
         self._flat_wanted = False
         self._flat_was_last = False
 
@@ -59,15 +59,15 @@ class FramePolicy:
         solved: SolutionKey | None,
         flat: SolutionKey | None,
     ) -> Decision:
-        """Decide what the solver does next.
+        """Decide what the solver should do next.
 
         Args:
-            request: The newest request.
+            request: The latest request.
             plan: Savings to apply. None if no plan has been made.
-            state_version: Version of the present state of the run.
-            revision: Revision of the content at `request.time_ns`.
-            solved: Key of the newest solution.
-            flat: Key of the newest flat picture.
+            state_version: Version of the run's current state.
+            revision: The content's revision at `request.time_ns`.
+            solved: The latest solution's key, or None if there is none.
+            flat: The latest flat picture's key, or None if there is none.
         """
         if request.flat_wanted and not self._flat_wanted:
             self.episode += 1
@@ -92,9 +92,9 @@ class FramePolicy:
     def _eyes_to_solve(
         self, request: SolveRequest, plan: Plan | None, *, state_version: int, revision: int, solved: SolutionKey | None
     ) -> F64 | None:
-        """Return the eyes (2, 3) to solve for.
+        """Choose the eyes (2, 3) to solve for.
 
-        The result is None if the newest solution is still valid or no eyes are known.
+        Returns None if the latest solution is still valid or if no eyes are known.
         """
         if request.eyes_m is None:
             return None
@@ -106,32 +106,32 @@ class FramePolicy:
 
 
 def _is_more(effort: Effort | None, done: Effort | None) -> bool:
-    """Return True if `effort` has a finer raster than `done`, or more steps on the same raster."""
+    """Return True if `effort` uses a finer raster than `done`, or more steps on the same raster."""
     if effort is None or done is None:
         return False
     return (-effort.reduction, effort.steps) > (-done.reduction, done.steps)
 
 
 def wants_flat(eyes: EyesEstimate, *, flat_asked: bool, flatness: float) -> bool:
-    """Return True if the flat picture is shown or may be needed soon.
+    """Return True if the flat picture is being shown or may be needed soon.
 
     Args:
         eyes: Eyes at the display time.
-        flat_asked: True if the operator asked for the flat picture.
-        flatness: Present weight of the flat picture in the blend.
+        flat_asked: True if the operator has asked for the flat picture.
+        flatness: The flat picture's current weight in the blend.
     """
     return flat_asked or flatness > 0.0 or eyes.label in ("held", "none")
 
 
 @dataclass(slots=True)
 class Flatness:
-    """Fades the flat picture in and out by changing its mixing weight at a constant rate."""
+    """Fades the flat picture in or out by changing its mixing weight at a constant rate."""
 
-    value: float = 1.0  # mixing weight, from 0 (solution alone) to 1 (flat picture alone)
-    since_ns: int = -1  # time of the last call of `toward`; -1 before the first call
+    value: float = 1.0  # mixing weight, from 0 (only the solution) to 1 (only the flat picture)
+    since_ns: int = -1  # when `toward` was last called; -1 before the first call
 
     def toward(self, target: float, *, now_ns: int) -> float:
-        """Move `value` towards `target` according to the time since the last call, and return the new value."""
+        """Move `value` towards `target`, in proportion to the time since the last call, and return it."""
         elapsed_s = 0.0 if self.since_ns < 0 else (now_ns - self.since_ns) / NS_PER_S
         self.since_ns = now_ns
         step = elapsed_s / BLEND_S

@@ -1,8 +1,7 @@
-"""Present the newest solution at every refresh, aligned to the eyes at the display time.
+"""Present the latest solution at every refresh, aligned to the eyes at the display time.
 
-At each refresh, the presenter takes the samples that have arrived, predicts the eyes, aligns the newest solution to the
-eyes at the display time, presents the solution and records the result. The loop waits only for the time slot of the
-next refresh.
+At each refresh, the presenter takes in the samples that have arrived, predicts the eyes at the display time, aligns the
+latest solution to them, presents it and records the result. The loop only ever waits for the next refresh's time slot.
 The solver (`solver_host`) runs in parallel and delivers complete solutions.
 """
 
@@ -48,9 +47,9 @@ log = logging.getLogger("phasestack.presenter")
 
 
 class Supervisor:
-    """Hooks through which the daemon controls the presenter.
+    """Hooks that let the daemon control the presenter.
 
-    The presenter calls each hook once per refresh. The hooks must not wait.
+    Each hook is called once per refresh and must not block.
     """
 
     def stop_reason(self) -> str:
@@ -58,25 +57,25 @@ class Supervisor:
         return ""
 
     def carry_out_commands(self, presenter: Presenter) -> None:
-        """Carry out the operator's commands that have been received since the last refresh."""
+        """Carry out all operator commands received since the last refresh."""
 
     def refreshed(self, presenter: Presenter, account: RefreshAccount) -> None:
-        """Handle the account of a completed refresh."""
+        """Handle a completed refresh's account."""
 
 
 @dataclass(frozen=True, slots=True)
 class Refresh:
-    """Data of one refresh that is passed to observers."""
+    """A refresh's data, as passed to observers."""
 
     account: RefreshAccount
     frame: PanelFrame
-    solution: Solution | None  # newest solution at this refresh
+    solution: Solution | None  # the latest solution at the time of this refresh
 
 
 class Observer(Protocol):
-    """Receiver of samples and refreshes.
+    """Receives samples and refreshes.
 
-    The presenter calls the methods during each refresh, and they must return quickly.
+    The methods are called during each refresh, so they must return quickly.
     """
 
     def sampled(self, sample: SensorFrame) -> None:
@@ -87,9 +86,9 @@ class Observer(Protocol):
 
 
 class RefreshTimes:
-    """Measures the stage times of a refresh.
+    """Measures how long each stage of a refresh takes.
 
-    On a simulated clock, each stage takes its configured time and advances the clock by this time.
+    On a simulated clock, each stage takes the configured time, and the clock is advanced by that time.
     """
 
     def __init__(self, clock: Clock, simulated_ms: Mapping[str, float]) -> None:
@@ -104,29 +103,29 @@ class RefreshTimes:
         return self._simulated is not None
 
     def lap(self, stage: str) -> None:
-        """Add the time since the last lap to `stage`."""
+        """Record the time since the last lap as the time taken by `stage`."""
         self._watch.lap(stage)
         if self._simulated is None:
             self.stage_ms[stage] = self._watch.stage_ms[stage]
         elif stage not in self.stage_ms:
             cost_ms = self._simulated_ms.get(stage, 0.0)
-            if stage != "wait":  # waiting advances the simulated clock anyway
+            if stage != "wait":  # while waiting, the simulated clock has advanced anyway
                 self._simulated.advance_ns(round(cost_ms * NS_PER_MS))
             self.stage_ms[stage] = cost_ms
 
     def overhead_ms(self) -> float:
-        """Return the time in milliseconds that the refresh has taken on the machine's clock.
+        """Return how long the refresh has taken on the machine's clock, in milliseconds.
 
-        The times of presenting and waiting are not included.
+        Time spent presenting and waiting is not included.
         """
         whole_ms = (perf_counter_ns() - self._start_ns) / NS_PER_MS
         return max(0.0, whole_ms - sum(self._watch.stage_ms.get(stage, 0.0) for stage in ("present", "wait")))
 
 
 class Presenter:
-    """Runs the refresh loop of one run.
+    """Runs a run's refresh loop.
 
-    The caller owns the parts that are passed to the constructor, and must close them.
+    All parts passed to the constructor belong to the caller, who must close them.
     """
 
     def __init__(
@@ -148,18 +147,19 @@ class Presenter:
         """Create a presenter.
 
         Args:
-            run: Holder of the run's state.
-            stack: Panels of the display.
-            clock: Clock of the run.
-            pacer: Scheduler of the refreshes.
+            run: Cell that holds the run's state.
+            stack: The display's panels.
+            clock: The run's clock.
+            pacer: Schedules the refreshes.
             samples: Source of samples.
-            viewer: Viewer whose eyes are estimated from the samples.
-            solver: Host of the solver.
+            viewer: Estimates the viewer's eyes from the samples.
+            solver: Runs the solver.
             panels: Panels to present on.
-            stage_ms: Duration in milliseconds of each stage of a refresh on a simulated clock.
-            supervisor: Hooks of the daemon.
-            observers: Receivers of all samples and refreshes.
-            fixed: Effort of every solution if `model.effort` is `full`. None means all steps on the full raster.
+            stage_ms: Duration of each stage of a refresh on a simulated clock, in milliseconds.
+            supervisor: The daemon's hooks.
+            observers: Objects that receive all samples and refreshes.
+            fixed: Effort to use for every solution if `model.effort` is `full`. None means all steps on the full
+                raster.
         """
         self.run_cell, self.stack, self.clock = run, stack, clock
         self.pacer, self.samples, self.viewer, self.solver, self.panels = pacer, samples, viewer, solver, panels
@@ -172,18 +172,18 @@ class Presenter:
         self._lateness = Lateness(pacer.period_ns)
         self.flat_asked = False
         self.paused = False
-        self.missing: dict[str, str] = {}  # reason for each part that has failed
+        self.missing: dict[str, str] = {}  # reason for each failed part
         self.last: Refresh | None = None
         self._flatness = Flatness()
         self._presented = False
         self._shown_solution: int | None = None  # number of the solution shown at the previous refresh
-        self._drew_solution = False  # True once any solution has been on the panels
-        self._aligned: tuple[int, bytes, Alignment] | None = None  # newest alignment, with its solution number and eyes
+        self._drew_solution = False  # True once the panels have shown a solution
+        self._aligned: tuple[int, bytes, Alignment] | None = None  # number of the solution, eyes, alignment
 
     def run(self, *, frames: int | None = None) -> str:
-        """Refresh the panels until the run ends, and return the reason for the end.
+        """Refresh the panels until the run ends, and return the reason for ending.
 
-        The run ends when the recording has ended, when `frames` refreshes are done, or when a stop is requested.
+        The run ends once the recording has ended, `frames` refreshes have been done, or a stop has been requested.
         """
         reason = ""
         while not reason:
@@ -198,10 +198,10 @@ class Presenter:
         return reason
 
     def refresh(self) -> RefreshAccount:
-        """Run one refresh and return its account.
+        """Carry out one refresh and return its account.
 
         Raises:
-            EndOfRecording: The recording that serves as the sensor has ended.
+            EndOfRecording: The recording that replaces the sensor has ended.
             FatalError: The sensor has failed permanently.
         """
         times = RefreshTimes(self.clock, self._stage_ms)
@@ -219,7 +219,7 @@ class Presenter:
         times.lap("track")
         report, lost = self._present(frame)
         times.lap("present")
-        if report is not None and times.simulated:  # the lap has advanced the clock by the cost of presenting
+        if report is not None and times.simulated:  # the lap has advanced the clock by the cost of presenting it
             report = replace(report, present_ns=self.clock.now_ns())
         photon_ns = self._presented_at(timing, report, woke_ns=woke_ns)
         request = self._aim.request(
@@ -238,7 +238,7 @@ class Presenter:
         return account
 
     def _adopt_settings(self) -> None:
-        """Adopt settings that changed since the last refresh."""
+        """Adopt any settings changed since the last refresh."""
         state = self.run_cell.state
         if state.version != self._adopted:
             self._adopted = state.version
@@ -251,16 +251,16 @@ class Presenter:
                 observer.sampled(sample)
 
     def _compose(self, timing: FrameTiming, eyes: EyesEstimate, news: SolverUpdate) -> tuple[PanelFrame, str]:
-        """Return the frame for the panels, and the reason if the alignment is at its limit.
+        """Return the frame to present, and the reason if the alignment has reached a limit.
 
-        The reason is "" if the alignment is within its limits.
+        The reason is "" if it has not.
         """
         solution, flat = news.solution, news.flat
         target = 1.0 if eyes.eyes_m is None or self.flat_asked else 0.0
         if solution is None:
             self._flatness.value = 1.0
         elif not self._drew_solution and target == 0.0:
-            self._flatness.value = 0.0  # no fade-in for the first picture
+            self._flatness.value = 0.0  # show the first picture without fading it in
         flatness = self._flatness.value
         if not self.paused:
             flatness = self._flatness.toward(target, now_ns=self.clock.now_ns())
@@ -283,10 +283,10 @@ class Presenter:
         return frame, alignment.limited
 
     def _alignment(self, eyes: EyesEstimate, solution: Solution | None) -> Alignment:
-        """Return the alignment of the solution to the eyes.
+        """Align the solution to the eyes.
 
-        If no eyes are known, the previous alignment of the same solution is returned. The alignment has no matrices if
-        the layers are shown as solved.
+        If no eyes are known, the same solution's previous alignment is returned. If the layers are shown as solved, the
+        alignment contains no matrices.
         """
         plan = self.run_cell.state.settings.plan
         if solution is None or solution.solved_for_m is None or not plan.align:
@@ -305,7 +305,7 @@ class Presenter:
         """Present a frame.
 
         Returns:
-            The report and "". If a panel is lost, None and the reason. If there is no picture yet, None and "".
+            The report and "", or None and the reason if a panel is lost, or None and "" if there is no picture yet.
         """
         if frame.solved is None and frame.flat is None:
             return None, ""
@@ -319,7 +319,7 @@ class Presenter:
         return report, ""
 
     def _presented_at(self, timing: FrameTiming, report: PresentReport | None, *, woke_ns: int) -> int:
-        """Report the outcome of a refresh to the pacer, and return the display time."""
+        """Tell the pacer what happened to a refresh, and return its display time."""
         blank_ns = report.vblank_ns if report is not None else None
         return self.pacer.presented(timing, woke_ns=woke_ns, done_ns=self.clock.now_ns(), blank_ns=blank_ns)
 
@@ -362,7 +362,7 @@ class Presenter:
         state: State,
         times: RefreshTimes,
     ) -> RefreshAccount:
-        solution = news.solution if report is not None and frame.flatness < 1.0 else None  # None if it is not visible
+        solution = news.solution if report is not None and frame.flatness < 1.0 else None  # None if not visible
         ran = solution is not None and solution.number != self._shown_solution
         stage_ms = dict(times.stage_ms)
         if solution is not None and ran:
@@ -400,7 +400,7 @@ class Presenter:
             observer.refreshed(self.last)
 
     def summary(self, *, simulated: bool = False) -> dict[str, Any]:
-        """Return the part of summary.json with counts, times, model and states (docs/contracts.md).
+        """Return the counts, times, model and states for summary.json (docs/contracts.md).
 
         Args:
             simulated: True if the run's clock is simulated.

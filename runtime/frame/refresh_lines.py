@@ -1,4 +1,4 @@
-"""Write refreshes to frames.jsonl, and measure their view errors once the true eyes are known."""
+"""Write each refresh to frames.jsonl, and measure its view error once the true eyes are known."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from runtime.frame.stats import Quantiles
 from runtime.frame.truth import TrueEyes
 from runtime.records import RefreshAccount, State
 
-WAITING_MAX = 2048  # largest number of queued refreshes; beyond this number, the oldest is written without true eyes
+WAITING_MAX = 2048  # when this many refreshes are queued, the oldest is written without true eyes
 LINE = (
     "frame", "capture_ns", "predicted_for_ns", "present_ns", "eyes_m", "eyes_label", "eye_sigma_mm", "state",
     "solution", "effort", "solved_for_m", "solution_age_ms", "true_eyes_m", "inference", "presented", "stage_ms",
@@ -21,23 +21,23 @@ LINE = (
 
 
 class RefreshLines:
-    """Writes refreshes to frames.jsonl and collects their view errors.
+    """Writes a line for each refresh to frames.jsonl and collects the view errors.
 
-    Refreshes are written in order. Each refresh is queued until the true eyes at its display time are known or known to
-    be unavailable.
+    Lines are written in order. Each refresh is queued until the true eyes at its display time are known, or until it is
+    clear that they never will be.
     """
 
     def __init__(self, truth: TrueEyes, write: Callable[[dict[str, Any]], None] | None) -> None:
         self._truth, self._write = truth, write
         self._waiting: deque[RefreshAccount] = deque()
-        self.view_error_mm = Quantiles()  # view errors of refreshes that show a solution and have known true eyes
+        self.view_error_mm = Quantiles()  # for each refresh that shows a solution, if the true eyes are known
 
     def add(self, account: RefreshAccount) -> None:
         """Queue a refresh."""
         self._waiting.append(account)
 
     def advance(self) -> None:
-        """Write the queued refreshes whose true eyes are known or known to be unavailable."""
+        """Write each queued refresh whose true eyes are known or will never be known."""
         while self._waiting:
             photon_ns = self._waiting[0].photon_ns
             if self._truth.may_come(photon_ns) and len(self._waiting) < WAITING_MAX:
@@ -50,7 +50,7 @@ class RefreshLines:
 
 
 def line_of(account: RefreshAccount) -> dict[str, Any]:
-    """Convert the account of a refresh to a line of frames.jsonl (docs/contracts.md)."""
+    """Convert a refresh's account to a line for frames.jsonl (docs/contracts.md)."""
     return {name: _plain(getattr(account, name)) for name in LINE}
 
 

@@ -1,4 +1,4 @@
-"""Immutable state of a run, which a reconfiguration replaces as a whole."""
+"""A run's immutable state, replaced as a whole by each reconfiguration."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ LEFT_BEHIND = "content or model took too long to load, so the solver was restart
 
 @dataclass(frozen=True, slots=True)
 class RunState:
-    """Settings, calibration, content and model that are used together.
+    """The settings, calibration, content and model that a run uses together.
 
     The solver owns the content and the model.
     """
 
-    version: int  # number that differs for every state of a run
+    version: int  # unique among the states of a run
     settings: Settings
     calibration: Calibration
     content: ContentSource
@@ -31,10 +31,10 @@ class RunState:
 
 
 class RunCell:
-    """Holds the newest `RunState` and replaces it atomically.
+    """Holds the latest `RunState` and replaces it atomically.
 
-    Any thread may read `state`. Callers that need several fields should read `state` once, because it may be replaced
-    between two reads.
+    Any thread may read `state`. To use several fields, read `state` only once, because it may be replaced between two
+    reads.
     """
 
     def __init__(
@@ -42,31 +42,31 @@ class RunCell:
     ) -> None:
         self._lock = threading.Lock()
         self._numbers = count(1)
-        self.generation = 0  # number of the newest solver
+        self.generation = 0  # number of the latest solver
         self.state = RunState(0, settings, calibration, content, predictor)
 
     def next_number(self) -> int:
-        """Return a number for a new solution or flat picture, unique within the run."""
+        """Return a number, unique within the run, for a new solution or flat picture."""
         with self._lock:
             return next(self._numbers)
 
     def begin(self) -> int:
         """Begin a new solver generation and return its number.
 
-        Solvers of older generations can no longer change the state.
+        After this, solvers from older generations can no longer change the state.
         """
         with self._lock:
             self.generation += 1
             return self.generation
 
     def replace(self, generation: int | None = None, **changes: Any) -> RunState:
-        """Replace fields of the state and return the old state.
+        """Replace some of the state's fields and return the old state.
 
-        The caller must close the parts that were replaced.
+        The caller must close any content or model that was replaced.
 
         Args:
-            generation: Generation of the calling solver. None replaces the state in any generation.
-            changes: New values by field name.
+            generation: The calling solver's generation. None replaces the state in any generation.
+            changes: New values, keyed by field name.
 
         Raises:
             Stopped: A newer generation has begun. The state is not changed.

@@ -1,10 +1,10 @@
-"""Measure the quality of sampled refreshes once their true eyes are known.
+"""Measure the quality of a sample of refreshes, each once its true eyes are known.
 
-The solver's thread draws the target pictures. In real time, a background thread compares the target pictures with the
-layers of one refresh at a time and takes the newest refresh first. The background thread is busy for only a small share
-of the run, because measuring must not slow down the solutions that are measured. A few refreshes that become due while
-a measurement is running are queued and measured after the run. The other due refreshes are dropped. On a simulated
-clock, every due refresh is measured in order.
+The target pictures are drawn on the solver's thread. In real time, a background thread compares them with one refresh's
+layers at a time, starting with the newest refresh. It works during only a small share of the run, because measuring
+must not slow down the solutions being measured. If refreshes come due while a measurement is running, a few of them are
+queued and measured after the run, and the others are dropped. On a simulated clock, every refresh that is due is
+measured, in order.
 """
 
 from __future__ import annotations
@@ -29,24 +29,24 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F64, State
 from runtime.support.background import MEASURING_NICENESS, BackgroundJob
 
-HELD_MAX = 5  # largest number of refreshes queued in real time
-HELD_BYTES = 200 << 20  # limit for the layers of queued refreshes; a refresh takes 25 MB at 1080p on the full raster
-MEASURING_SHARE = 0.1  # share of a real-time run that is spent on measuring
+HELD_MAX = 5  # maximum number of refreshes queued in real time
+HELD_BYTES = 200 << 20  # limit for the queued refreshes' layers; a refresh takes 25 MB at 1080p on the full raster
+MEASURING_SHARE = 0.1  # largest share of a real-time run spent on measuring
 MEASURED_WITHIN_S = 60.0  # timeout for measuring the queued refreshes after the run
-LOOK_S = 0.02  # interval between checks for completion
-DRAWN_WITHIN_S = 10.0  # timeout for drawing the target pictures of the last refresh
+LOOK_S = 0.02  # interval for checking whether the queue is done
+DRAWN_WITHIN_S = 10.0  # timeout for drawing the last refresh's target pictures
 
 
 @dataclass(frozen=True, slots=True)
 class _Sample:
     refresh: Refresh
-    content: object | None  # content of the run at this refresh
+    content: object | None  # the run's content at this refresh
 
 
 class QualitySampler:
-    """Measures the quality of every `every`-th refresh, and of the last refresh if `finish` is called.
+    """Measures the quality of every `every`-th refresh and, if `finish` is called, of the last one.
 
-    If `every` is 0, no other refresh is measured.
+    If `every` is 0, only the last refresh is measured.
     """
 
     def __init__(
@@ -60,21 +60,21 @@ class QualitySampler:
     ) -> None:
         self._stack, self._drawer, self._truth = stack, drawer, truth
         self._every, self._simulated = every, simulated
-        self.only_live = False  # True to measure only live quality
-        self.measured: dict[str, list[float]] = {}  # values of the sampled refreshes, by name in FIGURES
-        self.live: dict[int, float] = {}  # mean squared error of light at the true eyes, by refresh number
-        self.moment: Moment | None = None  # newest measured refresh, for stills, contact sheet and viewer page
+        self.only_live = False  # if True, only live quality is measured
+        self.measured: dict[str, list[float]] = {}  # values for each sampled refresh, keyed by name in FIGURES
+        self.live: dict[int, float] = {}  # mean squared error of the light at the true eyes, by refresh number
+        self.moment: Moment | None = None  # latest measured refresh, for the stills, contact sheet and viewer page
         self._waiting: deque[_Sample] = deque()
         self._job: BackgroundJob[RefreshQuality] | None = None
         self._job_frame = self._moment_frame = -1
         self._samples = 0
         self._drawing = False
-        self._began_s = self._resumes_s = 0.0  # start of the newest measurement, and earliest start of the next one
+        self._began_s = self._resumes_s = 0.0  # when the latest measurement began, and when the next may begin
 
     def refreshed(self, refresh: Refresh) -> None:
         """Queue a refresh if it is due.
 
-        In real time, earlier refreshes are dropped from the queue if the queue is too large.
+        In real time, if the queue is then too large, earlier refreshes are dropped from it.
         """
         is_sample = self._every and refresh.account.frame % self._every == self._every - 1
         if not is_sample or not refresh.account.presented:
@@ -96,7 +96,7 @@ class QualitySampler:
         """Measure the queued refreshes after the run.
 
         Args:
-            stopped: Function that is polled. Once it returns True, no further measurement is started.
+            stopped: Function polled during the wait. Once it returns True, no further measurement is started.
         """
         ends_s = time.monotonic() + MEASURED_WITHIN_S
         self._collect()
@@ -106,10 +106,11 @@ class QualitySampler:
                 time.sleep(LOOK_S)
 
     def advance(self, *, at_once: bool = False) -> None:
-        """Collect a finished measurement, and start measuring refreshes whose true eyes are now known.
+        """Collect a finished measurement, and measure queued refreshes if their true eyes are now known.
 
         Args:
-            at_once: Start the next measurement now, even if measuring takes more than `MEASURING_SHARE` of the run.
+            at_once: Start the next measurement now, even if measuring then takes more than `MEASURING_SHARE` of the
+                run.
         """
         self._collect()
         now_s = time.monotonic()
@@ -132,9 +133,9 @@ class QualitySampler:
             self._resumes_s = now_s + (now_s - self._began_s) * (1 / MEASURING_SHARE - 1)
 
     def finish(self, last: Refresh) -> None:
-        """Measure the last refresh of the run.
+        """Measure the run's last refresh.
 
-        The result is included in the means only if no other refresh has been measured.
+        The result counts towards the means only if no other refresh has been measured.
         """
         queue: SimpleQueue[RefreshTargets | None] = SimpleQueue()
         true_m = self._truth.at(last.account.photon_ns)
@@ -168,7 +169,7 @@ class QualitySampler:
         self._drawer.draw(wanted, sample.content, compare)
 
     def _wanted(self, refresh: Refresh, true_m: F64 | None) -> dict[str, tuple[F64, int]]:
-        """Return the eyes (2, 3) and the instants to draw targets for, by field of `RefreshTargets`."""
+        """Return the eyes (2, 3) and the time to draw each target for, keyed by field of `RefreshTargets`."""
         account, solution = refresh.account, refresh.solution
         wanted: dict[str, tuple[F64, int]] = {}
         if true_m is not None:
@@ -205,11 +206,11 @@ class QualitySampler:
 
     @property
     def live_db(self) -> float | None:
-        """Live quality in dB of the refreshes measured so far (docs/contracts.md, Error)."""
+        """Live quality of the refreshes measured so far, in dB (docs/contracts.md, Error)."""
         return round(psnr_db(float(np.mean(list(self.live.values())))), 3) if self.live else None
 
     def summary(self) -> dict[str, Any]:
-        """Return the part of summary.json with quality figures. Figures that were not measured are null."""
+        """Return the quality figures for summary.json. Any figure that was not measured is null."""
         means = {
             name: round(float(np.mean(self.measured[name])), 3) if name in self.measured else None for name in FIGURES
         }
@@ -218,7 +219,7 @@ class QualitySampler:
 
 
 def has_picture(refresh: Refresh) -> bool:
-    """Return True if the panels show a solution for two eyes, without any of the flat picture."""
+    """Return True if the panels show a solution for both eyes with none of the flat picture mixed in."""
     solution = refresh.solution
     return (
         refresh.account.presented

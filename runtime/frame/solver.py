@@ -1,4 +1,4 @@
-"""Draw content and compute layers for the predicted eyes, on the thread of the solver's GL context."""
+"""Draw content and compute layers for the predicted eyes, on the thread that owns the GL context."""
 
 from __future__ import annotations
 
@@ -27,65 +27,65 @@ from runtime.support.gl import DrawnPicture
 
 log = logging.getLogger("phasestack.solver")
 
-FLAT_EYE_M = (0.7, 0.0, 0.0)  # viewpoint of the flat picture before any viewer has been seen
+FLAT_EYE_M = (0.7, 0.0, 0.0)  # the flat picture's viewpoint until a viewer has been seen
 
 
 @dataclass(frozen=True, slots=True)
 class SolverUpdate:
-    """Results of one request. In `SolverHost.news`, the newest results of all requests."""
+    """The results of one request or, in `SolverHost.news`, the latest results of all requests."""
 
     solution: Solution | None = None  # a new solution for two eyes
     flat: Solution | None = None  # a new flat picture
-    missing: dict[str, str] = field(default_factory=dict)  # reason for each part (content, model) that has failed
+    missing: dict[str, str] = field(default_factory=dict)  # reason for each failed part (content, model)
 
 
 class Solver:
-    """Computes at most one solution or flat picture per step.
+    """Computes at most one solution or flat picture in each step.
 
-    A step uses the state of the run at the beginning of the step.
+    Each step uses the run's state as it was when the step began.
     """
 
     def __init__(self, run: RunCell, stack: PanelStack, *, timed: bool = True) -> None:
         """Create a solver for a run.
 
         Args:
-            run: Holder of the run's state.
-            stack: Panels of the display.
-            timed: Apply `model.budget_ms`. False on a simulated clock, where results must not depend on the speed of
-                the machine.
+            run: Cell that holds the run's state.
+            stack: The display's panels.
+            timed: True to apply `model.budget_ms`. False on a simulated clock, because results must then not depend on
+                the machine's speed.
         """
         self.run, self.stack, self._timed = run, stack, timed
-        self.measured = Measured()  # measured times and errors of the items of the plan
+        self.measured = Measured()  # times and errors measured for each item of the plan
         self.plan: Plan | None = None
         self._planned_for: tuple[int, tuple[bool, bool]] | None = None
         self._seeing = (True, True)
         self._policy = FramePolicy()
         self._solved: SolutionKey | None = None
         self._flat: SolutionKey | None = None
-        self._windows: dict[int, SolveWindow | None] = {}  # windows of the newest solutions, by reduction
-        self._kept: Job | None = None  # last job with copies of its pictures; None if pictures must be drawn again
+        self._windows: dict[int, SolveWindow | None] = {}  # window of the latest solution, keyed by reduction
+        self._kept: Job | None = None  # last job, with its pictures copied; None: draw them again
         self._meter = SolutionMeter()
         self._middle_m: F64 = np.array(FLAT_EYE_M)
         self._missing: dict[str, str] = {}
 
     def step(self, request: SolveRequest, state: RunState | None = None) -> SolverUpdate:
-        """Carry out a request and return its results.
+        """Carry out a request and return the results.
 
-        If the content or the model fails, the result names the failed part, and earlier results remain valid.
+        If the content or the model fails, the update names the failed part, and all earlier results remain valid.
 
         Args:
-            request: Request to carry out.
-            state: State of the run with which to draw and solve. None means the newest state.
+            request: The request to carry out.
+            state: The run's state to use for drawing and solving. None means the latest state.
 
         Raises:
-            ContextLost: The GL context was lost, so this solver has become unusable.
+            ContextLost: The GL context was lost, so this solver can no longer be used.
         """
         state = state or self.run.state
         self._replan(state, request.eyes_m)
         time_ns = request.time_ns
         try:
             revision = state.content.revision(time_ns=time_ns)
-        except (Exception, SystemExit) as error:  # including a vendor's `sys.exit()`
+        except (Exception, SystemExit) as error:  # including a `sys.exit()` in a vendor's code
             return SolverUpdate(missing=self._failed("content", error, expected=ContentFailure))
         job = self._policy.next_job(
             request,
@@ -103,7 +103,7 @@ class Solver:
                 wanted = Effort(1, state.predictor.steps)
             return self._solve(state, request, job.eyes_m, wanted, revision=revision)
         if request.eyes_m is not None and not request.paused:
-            self._missing = {}  # the newest solution already satisfies the request
+            self._missing = {}  # the latest solution already fulfils the request
         return SolverUpdate(missing=dict(self._missing))
 
     def _solve(
@@ -120,7 +120,7 @@ class Solver:
                 job = self._kept
             else:
                 job = self._drawn(state, request, eyes_m, effort.reduction)
-        except ContextLost:  # content and model exist only in the context, so the owner must start another solver
+        except ContextLost:  # content and model were lost with it, so the owner must start another solver
             raise
         except (Exception, SystemExit) as error:
             return SolverUpdate(missing=self._failed("content", error, expected=ContentFailure))
@@ -153,9 +153,9 @@ class Solver:
         return SolverUpdate(solution=solution)
 
     def _drawn(self, state: RunState, request: SolveRequest, eyes_m: F64, reduction: int) -> Job:
-        """Draw the target pictures of a solution.
+        """Draw a solution's target pictures.
 
-        The pictures for a resting head are also copied, because the solution may be refined later.
+        If the head is at rest, the pictures are also copied, because the solution may be refined later.
         """
         job = drawn_job(
             state.predictor,
@@ -195,18 +195,18 @@ class Solver:
         return SolverUpdate(flat=flat, missing=missing)
 
     def plan_items(self, measured: Measured | None = None) -> tuple[PlanItem, ...]:
-        """Return the savings that the plan applies, with the times and errors that have been measured.
+        """Return the savings applied by the plan, with the times and errors measured for them.
 
-        The method is thread-safe.
+        Thread-safe.
 
         Args:
-            measured: Times and errors to report. None means the solver's own measurements.
+            measured: Times and errors to report. None means those measured by this solver.
         """
         state = self.run.state
         return self._plan_of(state, self._seeing, measured or self.measured).items
 
     def _replan(self, state: RunState, eyes_m: F64 | None) -> None:
-        """Update the plan if the state of the run or the set of eyes that can see the display has changed."""
+        """Update the plan if the run's state or the set of eyes that can see the display has changed."""
         seeing = self._seeing if eyes_m is None else seeing_eyes(eyes_m, self._seeing)
         self._seeing = seeing
         made_for = (state.version, seeing)

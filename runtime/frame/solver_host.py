@@ -1,4 +1,4 @@
-"""Interface between the presenter and a solver, with an implementation for a simulated clock."""
+"""Interface between the presenter and a solver, and an implementation for a simulated clock."""
 
 from __future__ import annotations
 
@@ -12,35 +12,35 @@ from runtime.frame.effort import Costs
 from runtime.frame.solver import SolverUpdate
 from runtime.records import SolveRequest
 
-FIRST_REQUEST = SolveRequest(0, None, "none", 0.0, flat_wanted=True)  # asks for the flat picture, before any refresh
+FIRST_REQUEST = SolveRequest(0, None, "none", 0.0, flat_wanted=True)  # asks for the flat picture before any refresh
 
-SHOWN_STAGES = ("render", "prepare", "inference", "finish")  # stages in frames.jsonl, where `finish` includes steps
+SHOWN_STAGES = ("render", "prepare", "inference", "finish")  # in frames.jsonl, `finish` includes the steps
 
 
 class SolverParts(Protocol):
-    """A solver and the resources of its thread, such as a GL context."""
+    """A solver and its thread's resources, such as a GL context."""
 
     def step(self, request: SolveRequest) -> SolverUpdate:
         """Carry out one request and return its results."""
 
     def simulated_costs(self) -> Costs:
-        """Return the costs that solutions have on a simulated clock under the present settings."""
+        """Return the solution costs that apply on a simulated clock with the current settings."""
 
     def first_costs(self) -> Mapping[int, Mapping[str, float]]:
-        """Return the times in milliseconds that were measured while warming up, by reduction and stage."""
+        """Return the times measured during warm-up, in milliseconds, keyed by reduction and then stage."""
 
     def close(self) -> None:
-        """Release all resources that no newer solver uses.
+        """Release all resources not in use by a newer solver.
 
-        This method is called on the thread that created the solver.
+        Called on the thread that created the solver.
         """
 
 
-Task = Callable[[SolverParts], bool]  # function called between steps on the solver's thread until it returns True
+Task = Callable[[SolverParts], bool]  # called between steps on the solver's thread until it returns True
 
 
 class SolverHost(ABC):
-    """Base class of hosts, which run a solver for the presenter.
+    """Base class for hosts, which run a solver on the presenter's behalf.
 
     The presenter posts requests and reads results. Neither operation waits for the solver.
     """
@@ -48,42 +48,42 @@ class SolverHost(ABC):
     @property
     @abstractmethod
     def costs(self) -> Costs:
-        """Current costs of solutions."""
+        """Current solution costs."""
 
     @abstractmethod
     def post(self, request: SolveRequest) -> None:
-        """Request a solution. The request replaces an earlier request that has not begun."""
+        """Request a solution, replacing any earlier request that has not been started."""
 
     @abstractmethod
     def news(self) -> SolverUpdate:
-        """Return the newest complete solution and flat picture, and the failed parts."""
+        """Return the latest complete solution and flat picture, and the parts that have failed."""
 
     @abstractmethod
     def do(self, task: Task) -> None:
-        """Run a task between steps of the solver, repeatedly until the task returns True."""
+        """Run a task between solver steps, again and again until it returns True."""
 
     @abstractmethod
     def close(self) -> None:
-        """Stop the solver and release its resources. The method may be called twice."""
+        """Stop the solver and release its resources. May be called more than once."""
 
 
 def taken_in(news: SolverUpdate, step: SolverUpdate) -> SolverUpdate:
-    """Return `news` updated with the results of a step and with the parts that failed in the step."""
+    """Return `news` updated with a step's results and with the parts that failed during the step."""
     return SolverUpdate(step.solution or news.solution, step.flat or news.flat, step.missing)
 
 
 class SimulatedSolver(SolverHost):
     """Runs a solver on a simulated clock.
 
-    A request is computed immediately. Its result is published once the simulated clock has advanced by the configured
-    cost of the solution.
+    Computes each request immediately, but publishes the result only once the simulated clock has advanced by the
+    solution's configured cost.
     """
 
     def __init__(self, parts: SolverParts, clock: Clock) -> None:
         self._parts, self._clock = parts, clock
         self._news = taken_in(SolverUpdate(), parts.step(FIRST_REQUEST))
         self._posted: tuple[int, SolveRequest] | None = None
-        self._under_way: tuple[int, SolverUpdate] | None = None  # completion time in nanoseconds, and result
+        self._under_way: tuple[int, SolverUpdate] | None = None  # completion time in ns, and result
         self._idle_since_ns = clock.now_ns()
         self._tasks: list[Task] = []
         self._closed = False
@@ -111,7 +111,7 @@ class SimulatedSolver(SolverHost):
             self._parts.close()
 
     def _advance(self) -> None:
-        """Publish results, run tasks and begin requests in order, up to the present time."""
+        """Publish results, run tasks and start requests, in order, up to the current time."""
         now_ns = self._clock.now_ns()
         while True:
             if self._under_way is not None:
@@ -129,7 +129,7 @@ class SimulatedSolver(SolverHost):
             self._under_way = begun_ns + cost_ns, step
 
     def _timed(self, step: SolverUpdate) -> tuple[SolverUpdate, int]:
-        """Return the result with the configured stage times, and the cost of the step in nanoseconds."""
+        """Return a step's result with the configured stage times filled in, and its cost in nanoseconds."""
         solution, flat, costs = step.solution, step.flat, self.costs
         if solution is not None and solution.effort is not None:
             effort = solution.effort

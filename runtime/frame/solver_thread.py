@@ -1,4 +1,4 @@
-"""Run a solver on its own thread, which is abandoned and replaced if a call hangs."""
+"""Run a solver on its own thread, and replace the thread if a call hangs."""
 
 from __future__ import annotations
 
@@ -23,31 +23,31 @@ from runtime.support.untrusted_input import LIMITS
 
 log = logging.getLogger("phasestack.solver")
 
-LATE_S = 0.5  # a step that takes longer is late; a step that takes twice as long is a fault by itself
-ABANDON_S = 10.0  # a thread whose step takes longer is abandoned, and a new solver is started
-# The limit is `LIMITS.start_s` for starting a solver, and `LIMITS.load_s` for a task, which may load content.
-IDLE_S = 0.02  # interval between checks for tasks while no requests arrive
-USUAL_S = 0.2  # time that a running step gets to finish when the host stops
-LATE_STEPS = 3  # number of consecutive late steps that cause a fault, and of punctual steps that clear the fault
-ANSWER_STEP_MS = 500  # resolution of the reported time without an answer
-ABANDONED_MAX = 4  # number of hung threads at which no new solver is started
+LATE_S = 0.5  # a longer step is late; a single step of more than twice this length is a fault
+ABANDON_S = 10.0  # if a step takes longer, its thread is abandoned and a new solver is started
+# Starting a solver may take up to `LIMITS.start_s`, and a task up to `LIMITS.load_s`, because it may load content.
+IDLE_S = 0.02  # interval for checking for tasks while no requests arrive
+USUAL_S = 0.2  # how long a running step gets to finish when the host stops
+LATE_STEPS = 3  # this many late steps in a row are a fault; this many steps in a row on time clear it
+ANSWER_STEP_MS = 500  # the reported time without an answer is rounded down to a multiple of this
+ABANDONED_MAX = 4  # no new solver is started while this many threads hang
 
 
 class _Attempt:
-    """State of one thread that runs one solver. The results of an abandoned thread are ignored."""
+    """State of a thread that runs one solver. Once the thread is abandoned, its results are ignored."""
 
     def __init__(self, number: int) -> None:
         self.number, self.abandoned = number, threading.Event()
         self.ready = threading.Event()
-        self.busy_since_ns = 0  # start of the running step or task; 0 while idle
+        self.busy_since_ns = 0  # when the current step or task started; 0 while idle
         self.is_at_task = False
-        self.took_ns: deque[int] = deque(maxlen=LATE_STEPS)  # durations of the last steps
-        self.costs: CostBook | None = None  # costs of solutions measured on this machine and scene
-        self.error: BaseException | None = None  # error that ended the thread
+        self.took_ns: deque[int] = deque(maxlen=LATE_STEPS)  # durations of the latest steps
+        self.costs: CostBook | None = None  # solution costs measured on this machine with this scene
+        self.error: BaseException | None = None  # the error that ended the thread
         self.thread: threading.Thread | None = None
 
     def leave(self) -> None:
-        """Make the thread end between two drawing calls, because drawing repeatedly takes the GIL."""
+        """Make the thread end at its next drawing call, because drawing takes the GIL again and again."""
         if self.thread is not None and self.thread is not threading.current_thread():
             abandon(self.thread)
 
@@ -55,17 +55,17 @@ class _Attempt:
 class SolverThread(SolverHost):
     """Runs a solver in parallel with the presenter.
 
-    If the solver hangs, its thread is abandoned and a new solver is started on another thread. `post` and `news` never
-    wait for the solver.
+    If the solver hangs, its thread is abandoned, and a new solver is started on a new thread. Neither `post` nor `news`
+    ever waits for the solver.
     """
 
     def __init__(self, make: Callable[[], SolverParts], clock: Clock) -> None:
         """Start a solver on a new thread.
 
         Args:
-            make: Function that creates a solver and its GL context on the calling thread. It is called again after a
+            make: Function that creates a solver and its GL context on the thread calling it. It is called again after a
                 hang or an error.
-            clock: Clock of the run.
+            clock: The run's clock.
         """
         self._make, self._clock = make, clock
         self._late_ns, self._abandon_ns = round(LATE_S * NS_PER_S), round(ABANDON_S * NS_PER_S)
@@ -81,15 +81,15 @@ class SolverThread(SolverHost):
         self._attempt = self._begin(1)
 
     def wait_ready(self, go_on: Callable[[], bool] = lambda: True, *, max_s: float = math.inf) -> None:
-        """Wait until the solver accepts requests.
+        """Wait until the solver is ready for requests.
 
         Args:
-            go_on: Function that is polled. Waiting ends without an error if it returns False.
-            max_s: Longest time to wait in seconds.
+            go_on: Function polled during the wait. If it returns False, waiting ends without an error.
+            max_s: How long to wait at most, in seconds.
 
         Raises:
             FatalError: The solver is not ready after `max_s`.
-            BaseException: Any error that prevented the start of the solver.
+            BaseException: The error that prevented the solver from starting.
         """
         begun_ns = self._clock.now_ns()
         while not self._attempt.ready.wait(0.1):
@@ -102,7 +102,7 @@ class SolverThread(SolverHost):
 
     @property
     def costs(self) -> Costs:
-        return self._costs or Costs(defaultdict(dict))  # no costs are known if a run is stopped while it starts
+        return self._costs or Costs(defaultdict(dict))  # no costs are known if a run is stopped during startup
 
     def post(self, request: SolveRequest) -> None:
         with self._lock:
@@ -122,10 +122,10 @@ class SolverThread(SolverHost):
     def close(self, timeout_s: float = 1.0) -> None:
         """Stop the solver and wait for its thread to end.
 
-        A solver that is still starting is not waited for, because `commands.guard` ends the process.
+        Does not wait for a solver that is still starting, because `commands.guard` ends the process.
 
         Args:
-            timeout_s: Longest time to wait in seconds.
+            timeout_s: How long to wait at most, in seconds.
         """
         self._closing.set()
         with self._lock:
@@ -140,9 +140,9 @@ class SolverThread(SolverHost):
             thread.join(patience_s(timeout_s))
 
     def _late_reason(self) -> str:
-        """Replace a hung thread, and return the reason why the solver is unavailable or late.
+        """Replace the thread if it hangs, and return the reason why the solver is unavailable or late.
 
-        The reason is "" if the solver works in time.
+        Returns "" if the solver is working on time.
         """
         attempt = self._attempt
         busy_ns = self._clock.now_ns() - attempt.busy_since_ns if attempt.busy_since_ns else 0
@@ -182,7 +182,7 @@ class SolverThread(SolverHost):
 
     def _live(self, attempt: _Attempt) -> None:
         self._run(attempt)
-        if not self._closing.is_set():  # return hundreds of MiB that the next solver's thread could not reuse
+        if not self._closing.is_set():  # returns hundreds of MiB that the next solver's thread could not use
             give_back()
 
     def _run(self, attempt: _Attempt) -> None:
@@ -216,20 +216,20 @@ class SolverThread(SolverHost):
                 if request is not None:
                     self._step(attempt, parts, request)
         except (ContextLost, Stopped) as error:
-            log.error("solver: %s", _line(error))  # log only text, because a traceback keeps large objects alive
+            log.error("solver: %s", _line(error))  # only the text, because a traceback keeps large objects alive
             attempt.error, attempt.busy_since_ns = error.with_traceback(None), self._clock.now_ns()
         except ThreadAbandoned:
             raise
-        except BaseException as error:  # an unexpected failure, caused by a bug in this program or a library
+        except BaseException as error:  # unexpected, due to a bug in this program or in a library
             log.exception("solver")
             attempt.error, attempt.busy_since_ns = error.with_traceback(None), self._clock.now_ns()
         finally:
             parts.close()
-            if attempt.abandoned.is_set():  # the error is no longer needed, and may keep large objects alive
+            if attempt.abandoned.is_set():  # no longer needed, but might keep large objects alive
                 attempt.error = None
 
     def _adopt_model(self, attempt: _Attempt, parts: SolverParts) -> None:
-        """Discard measured costs if a task has replaced the model, whose rasters and costs may differ."""
+        """Discard the measured costs if a task has replaced the model, because rasters and costs may differ."""
         assert attempt.costs is not None
         if (first := parts.first_costs()) != attempt.costs.first:
             attempt.costs = CostBook(first)
@@ -253,14 +253,14 @@ class SolverThread(SolverHost):
             self._costs = attempt.costs.costs()
 
     def _publish(self, attempt: _Attempt, step: SolverUpdate) -> bool:
-        """Add the results of a step to the news, and return True unless this thread has been abandoned."""
+        """Add a step's results to the news, and return True unless this thread has been abandoned."""
         with self._lock:
             if not attempt.abandoned.is_set():
                 self._news = taken_in(self._news, step)
             return not attempt.abandoned.is_set()
 
     def _do_tasks(self, attempt: _Attempt, parts: SolverParts) -> None:
-        """Run each queued task once. Unfinished tasks are queued again and run after the next step."""
+        """Run each queued task once. If a task is not finished, queue it again to run after the next step."""
         for _ in range(self._tasks.qsize()):
             if attempt.abandoned.is_set():
                 return

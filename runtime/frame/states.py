@@ -1,4 +1,4 @@
-"""Determine the daemon's state from the conditions at each refresh, and detect late refreshes."""
+"""Determine the daemon's state from the conditions at each refresh, and detect a late display."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ class Conditions:
     """Conditions observed at one refresh."""
 
     eyes: EyesLabel
-    missing: dict[Part, str]  # a short reason for each part that has failed
+    missing: dict[Part, str]  # a short reason for each failed part
     presented: bool  # True once any frame has been on the panels
     flat_wanted: bool = False  # True if the operator asked for the flat picture
-    stopping: str = ""  # reason why the run is stopping; empty while it is running
-    limited: str = ""  # reason why the alignment to the eyes is at its limit; empty if it is not at its limit
-    late: str = ""  # message if there are fewer refreshes than the display's rate requires; otherwise empty
-    paused: bool = False  # True if the operator froze the picture, which is still aligned to the eyes
+    stopping: str = ""  # why the run is stopping; empty while it continues
+    limited: str = ""  # which limit the alignment to the eyes has reached; empty if none
+    late: str = ""  # message if the display refreshes less often than its rate requires; otherwise empty
+    paused: bool = False  # True if the operator has frozen the picture; it is still aligned to the eyes
 
 
 def judge(conditions: Conditions) -> tuple[State, str]:
-    """Return the daemon's state and the reason for the state.
+    """Return the daemon's state and the reason for it.
 
     Stopping takes precedence over starting, starting over missing parts, and missing parts over the eyes.
     """
@@ -55,7 +55,7 @@ def judge(conditions: Conditions) -> tuple[State, str]:
 
 
 class StateMachine:
-    """Tracks the current state of the daemon and the time spent in each state."""
+    """Tracks the daemon's current state and the time spent in each state."""
 
     def __init__(self, *, now_ns: int) -> None:
         self.state = State.STARTING
@@ -66,13 +66,13 @@ class StateMachine:
 
     @property
     def name(self) -> str:
-        """Human-readable name of the state, such as `tracking` or `degraded: sensor, panel`."""
+        """The state's human-readable name, such as `tracking` or `degraded: sensor, panel`."""
         return f"{self.state}: {', '.join(self.missing)}" if self.state is State.DEGRADED else str(self.state)
 
     def update(self, conditions: Conditions, *, now_ns: int) -> bool:
-        """Update the state, and return True if the state or the set of missing parts has changed.
+        """Update the state, and return True if the state or the set of failed parts has changed.
 
-        The state no longer changes once it is STOPPING.
+        Once the state is STOPPING, it no longer changes.
         """
         self._held_ns[self.state] += now_ns - self._counted_ns
         self._counted_ns = now_ns
@@ -80,27 +80,27 @@ class StateMachine:
             return False
         before = self.name
         self.state, reason = judge(conditions)
-        self.reason = without_secrets(reason)  # a reason may contain a camera's address, and is widely readable
+        self.reason = without_secrets(reason)  # widely readable, but may contain a camera's address
         self.missing = tuple(part for part in PARTS if part in conditions.missing)
         return self.name != before
 
     def seconds(self, *, now_ns: int) -> dict[str, float]:
-        """Return the time in seconds spent so far in each state that has been entered."""
+        """Return the time spent so far in each state that has been entered, in seconds, keyed by state."""
         durations_ns = dict(self._held_ns)
         durations_ns[self.state] += now_ns - self._counted_ns
         return {str(state): held_ns / NS_PER_S for state, held_ns in durations_ns.items() if held_ns > 0}
 
 
 WINDOW_NS = NS_PER_S
-LATE_SHARE = 0.9  # the display is late if it shows less than this share of a second's refreshes
-WELL_SHARE = 0.95  # a late display is on time again if it shows at least this share
-REFRESHES_MAX = 1024  # largest number of refreshes counted in the window
+LATE_SHARE = 0.9  # the display is late if it shows less than this share of the refreshes due in a second
+WELL_SHARE = 0.95  # a late display is on time again once it shows at least this share
+REFRESHES_MAX = 1024  # maximum number of refreshes counted in the window
 
 
 class Lateness:
     """Detects a late display.
 
-    The display is late if the number of refreshes in the last second has been too small for more than one second.
+    The display is late once it has shown too few refreshes per second for more than one second.
     """
 
     def __init__(self, period_ns: int) -> None:
@@ -112,9 +112,9 @@ class Lateness:
         self._told_ns = 0
 
     def update(self, *, presented: bool, now_ns: int) -> str:
-        """Count a refresh, and return a message if the display is late or "" if it is on time.
+        """Count a refresh, and return a message if the display is late, or "" if it is on time.
 
-        The message has the form `late: 38 of 60 refreshes a second` and is updated once per second.
+        An example of the message is `late: 38 of 60 refreshes a second`. It is updated at most once per second.
         """
         if self._begun_ns is None:
             self._begun_ns = now_ns

@@ -1,6 +1,6 @@
-"""Statistics of a run in bounded memory.
+"""Collect a run's statistics in bounded memory.
 
-All times are on the run's clock, except `overhead_ms`, which is on the machine's clock.
+All times are measured on the run's clock, except `overhead_ms`, which is measured on the machine's clock.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from runtime.evaluation.refresh_quality import view_error_mm
 from runtime.frame.solver_host import SHOWN_STAGES
 from runtime.records import RefreshAccount, State
 
-WINDOW = 8192  # largest number of values kept for a quantile
-NOW_NS = NS_PER_S  # time window over which the present rates are measured
-NOW_KEPT = 1024  # largest number of refreshes in the time window
+WINDOW = 8192  # maximum number of values kept for each set of quantiles
+NOW_NS = NS_PER_S  # length of the window used to measure current rates
+NOW_KEPT = 1024  # maximum number of refreshes kept for this window
 STAGES = ("sensor", "track", *SHOWN_STAGES, "present", "wait")
 OVERHEAD_STAGES = ("sensor", "track")
 
 
 class Quantiles:
-    """Estimates quantiles of a stream of values in bounded memory.
+    """Estimates the quantiles of a stream of values in bounded memory.
 
-    At most `size` values are stored. When that many values are stored, every second stored value is dropped and the
-    sampling interval is doubled. The maximum is exact.
+    Stores at most `size` values. When the store is full, every second value is dropped and the sampling interval is
+    doubled. The maximum is exact.
     """
 
     def __init__(self, size: int = WINDOW) -> None:
@@ -46,7 +46,7 @@ class Quantiles:
         self._count += 1
 
     def of(self, *names: str) -> dict[str, float] | None:
-        """Return the named quantiles (`p50`, `p95`, `p99`, `max`, ...), or None if no value has been added."""
+        """Return the quantiles named (`p50`, `p95`, `p99`, `max`, ...), or None if no value has been added."""
         values = self._values[: -(-self._count // self._every)]
         if values.size == 0:
             return None
@@ -55,7 +55,7 @@ class Quantiles:
 
 
 class RunStats:
-    """Counts refreshes and faults of a run, and collects quantiles of its times."""
+    """Counts a run's refreshes and faults, and collects quantiles of its times."""
 
     def __init__(self) -> None:
         self.frames = self.presented = self.dropped = self.solutions = self.missed_blanks = 0
@@ -67,16 +67,16 @@ class RunStats:
         self._overhead_run, self._skew, self._age, self._sigma = Quantiles(), Quantiles(), Quantiles(), Quantiles()
         self._view_error = Quantiles()
         self._efforts_ns: dict[str, int] = {}
-        self._effort: str | None = None  # effort of the solution shown at the last refresh
-        self._recent: deque[tuple[int, bool, bool]] = deque(maxlen=NOW_KEPT)  # time, presented, shows a new solution
+        self._effort: str | None = None  # effort of the solution shown at the latest refresh
+        self._recent: deque[tuple[int, bool, bool]] = deque(maxlen=NOW_KEPT)  # time, presented, shows new solution
 
     def add(self, account: RefreshAccount, *, overhead_ms: float, missed_blanks: int = 0) -> None:
         """Count a refresh.
 
         Args:
-            account: Account of the refresh.
-            overhead_ms: Time that the refresh took on the machine's clock, not counting presenting and waiting.
-            missed_blanks: Number of vertical blanks missed since the start of the run.
+            account: The refresh's account.
+            overhead_ms: Time taken by the refresh on the machine's clock, excluding presenting and waiting.
+            missed_blanks: Number of vertical blanks missed since the run started.
         """
         now_ns, ran = account.present_ns, account.inference == "ran"
         self._first_ns = now_ns if self._first_ns < 0 else self._first_ns
@@ -111,19 +111,19 @@ class RunStats:
             self._view_error.add(view_error_mm(account.eyes_m, account.solved_for_m))
 
     def seconds(self) -> float:
-        """Return the time in seconds from the first refresh to the last refresh."""
+        """Return the time from the first refresh to the latest, in seconds."""
         return (self._last_ns - self._first_ns) / NS_PER_S if self.frames else 0.0
 
     def reuse_saves_ms(self) -> float | None:
-        """Return the solver time in ms saved by reusing a solution, or None if none has been reused."""
+        """Return the solver time saved by reusing a solution, in ms, or None if none has been reused."""
         medians = [self._stages[stage].of("p50") for stage in SHOWN_STAGES]
         known = [median["p50"] for median in medians if median is not None]
         return sum(known) if known and self.presented > self.solutions > 0 else None
 
     def rates_now(self) -> dict[str, float | None]:
-        """Return the rates of refreshes and solutions per second over the last second.
+        """Return the number of refreshes and of solutions per second, measured over the last second.
 
-        A rate is None if there were fewer than two refreshes in the last second.
+        Both rates are None if there were fewer than two refreshes in the last second.
         """
         newest_first = reversed(tuple(self._recent))
         recent = [*takewhile(lambda entry: entry[0] > self._last_ns - NOW_NS, newest_first)][::-1]
@@ -140,13 +140,14 @@ class RunStats:
         self.faults[part] = self.faults.get(part, 0) + 1
 
     def summary(self, *, stale_inputs: int, simulated: bool = False) -> dict[str, Any]:
-        """Return the part of summary.json with counts and times (docs/contracts.md).
+        """Return the counts and times for summary.json (docs/contracts.md).
 
-        Figures that were not measured are null.
+        Any figure that was not measured is null.
 
         Args:
-            stale_inputs: Number of samples that were superseded by a newer one.
-            simulated: True if the run's clock is simulated. The overhead is then taken from the configured stage times.
+            stale_inputs: Number of samples superseded by a newer one before use.
+            simulated: True if the run's clock is simulated. The overhead is then computed from the configured stage
+                times.
         """
         seconds = self.seconds()
         return {

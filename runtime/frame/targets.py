@@ -1,4 +1,4 @@
-"""Draw target pictures for given eyes on the solver's thread, in the GL context of the solver."""
+"""Draw target pictures for given eyes on the solver's thread, in the solver's GL context."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from runtime.optics.stack import PanelStack
 from runtime.plan.drawing import retina_pictures
 from runtime.records import F64
 
-Wanted = Mapping[str, tuple[F64, int]]  # eyes (2, 3) in frame `stack` and an instant, by field of `RefreshTargets`
+Wanted = Mapping[str, tuple[F64, int]]  # eyes (2, 3) in frame `stack` and a time, keyed by field of `RefreshTargets`
 
 
 class TargetDrawer:
-    """Draws target pictures between the steps of the solver."""
+    """Draws target pictures between solver steps."""
 
     def __init__(
         self,
@@ -27,14 +27,13 @@ class TargetDrawer:
         fov_deg: Callable[[], float],
         shown_content: Callable[[], object | None] = lambda: None,
     ) -> None:
-        """Create a drawer of target pictures.
+        """Create a target drawer.
 
         Args:
-            solver: Solver on whose thread the pictures are drawn.
-            stack: Panels of the display.
-            fov_deg: Function that returns the present field of view of target pictures, which a reload may change.
-            shown_content: Function that returns the present content of the run, or None if the content is never
-                replaced.
+            solver: Host of the solver whose thread draws the pictures.
+            stack: The display's panels.
+            fov_deg: Function that returns the target pictures' current field of view, which a reload may change.
+            shown_content: Function that returns the run's current content, or None if the content is never replaced.
         """
         self._solver, self._stack, self.fov_deg = solver, stack, fov_deg
         self.shown_content = shown_content
@@ -43,10 +42,10 @@ class TargetDrawer:
         """Draw the wanted pictures on the solver's thread, and pass them to `then`.
 
         Args:
-            wanted: Eyes and instant of each picture pair, by field of `RefreshTargets`.
-            content: Content of the run at the refresh to draw for. None means the present content.
-            then: Function that receives the pictures, on the solver's thread. It receives None if `content` has been
-                replaced or drawing failed. The state of the run gives the reason for the failure.
+            wanted: Eyes and time to draw each pair of pictures for, keyed by field of `RefreshTargets`.
+            content: The run's content at the refresh to draw for. None means the current content.
+            then: Function called with the pictures on the solver's thread, or with None if `content` has been replaced
+                or drawing has failed. In the latter case, the run's state gives the reason.
         """
 
         def task(parts: Any) -> bool:

@@ -1,4 +1,4 @@
-"""Estimate the viewer's eyes at any instant from calibrated and tracked samples of the sensor."""
+"""Estimate where the viewer's eyes are at any time, by calibrating and tracking the sensor's samples."""
 
 from __future__ import annotations
 
@@ -17,27 +17,26 @@ from runtime.records import EyesEstimate, SensorFrame
 
 log = logging.getLogger("phasestack.viewer")
 
-MAX_REST_DRIFT_M = 0.001  # drift of a resting head beyond which its position is updated
-IN_FRONT_M = 0.01  # eyes behind the front panel, or less than this distance in front of it, are ignored
+MAX_REST_DRIFT_M = 0.001  # if a resting head drifts farther than this, its position is updated
+IN_FRONT_M = 0.01  # eyes that are not at least this far in front of the front panel are ignored
 
 
 class Viewer:
-    """Estimates the eyes of one viewer in frame `stack` from the samples of a sensor.
+    """Estimates one viewer's eyes in the `stack` frame from a sensor's samples.
 
-    The class calibrates the samples, tracks the eyes and detects a head at rest. It is not thread-safe and never reads
-    a clock.
+    Calibrates the samples, tracks the eyes, and detects when the head is at rest. Not thread-safe. Never reads a clock.
     """
 
     def __init__(
         self, settings: Settings, calibration: Calibration, *, front_m: float, in_stack_frame: bool = False
     ) -> None:
-        """Create a viewer who has not been seen yet.
+        """Create an estimator for a viewer who has not been seen yet.
 
         Args:
-            settings: Settings of the run.
-            calibration: Calibration of the sensor.
-            front_m: x coordinate of the front panel, in frame `stack`.
-            in_stack_frame: True if the sensor already measures in frame `stack`.
+            settings: The run's settings.
+            calibration: The sensor's calibration.
+            front_m: The front panel's x coordinate in the `stack` frame.
+            in_stack_frame: True if the sensor's measurements are already in the `stack` frame.
         """
         self._settings, self._calibration = settings, calibration
         self._nearest_m, self._in_stack_frame = front_m + IN_FRONT_M, in_stack_frame
@@ -50,7 +49,7 @@ class Viewer:
     def adopt(self, settings: Settings, calibration: Calibration) -> None:
         """Adopt new settings and a new calibration.
 
-        The tracker is reset only if the tracker settings have changed.
+        The tracker is reset only if its settings have changed.
         """
         before, self._settings, self._calibration = self._settings, settings, calibration
         if settings.tracker != before.tracker:
@@ -65,27 +64,27 @@ class Viewer:
 
     @property
     def warning(self) -> str:
-        """Reason why most of the recent samples are implausible, such as swapped eyes, or ""."""
+        """Reason why most recent samples are implausible, such as swapped eyes; "" if they are not."""
         return self._refusals.warning
 
     @property
     def refused(self) -> Mapping[str, int]:
-        """Number of samples that the tracker has refused, by reason."""
+        """Number of samples refused by the tracker, keyed by reason."""
         return self._refusals.counts
 
     @property
     def rate_hz(self) -> float | None:
-        """Recent number of samples per second, or None if fewer than two samples have been captured."""
+        """Number of samples per second recently, or None if fewer than two samples have been captured."""
         if len(self._captures_ns) < 2 or self._captures_ns[-1] <= self._captures_ns[0]:
             return None
         return round((len(self._captures_ns) - 1) * NS_PER_S / (self._captures_ns[-1] - self._captures_ns[0]), 2)
 
     def take(self, frame: SensorFrame, *, serial: str) -> None:
-        """Process a sample. A sample that the tracker refuses is only counted.
+        """Process a sample. If the tracker refuses it, only count it.
 
         Args:
             frame: The sample.
-            serial: Serial number of the sensor, or "" if it is unknown.
+            serial: The sensor's serial number, or "" if it is unknown.
         """
         self._captures_ns.append(frame.capture_ns)
         points = frame.eyes
@@ -103,17 +102,17 @@ class Viewer:
                 log.warning("%s", warning)
 
     def at(self, display_ns: int) -> EyesEstimate:
-        """Return the eyes at the display time of a refresh, for aligning the solution that it shows."""
+        """Return the eyes at a refresh's display time, used to align the solution it shows."""
         return self._served(self._tracker.at(display_ns))
 
     def ahead(self, time_ns: int) -> EyesEstimate:
-        """Return the eyes at a later instant, for the solver to compute a solution for."""
+        """Return the eyes at a later time, used by the solver to compute a solution."""
         return self._served(self._tracker.ahead(time_ns))
 
     def _served(self, eyes: EyesEstimate) -> EyesEstimate:
-        """Return `eyes` after two corrections.
+        """Return `eyes`, corrected in two ways.
 
-        The eyes of a resting head are replaced by their fixed position. Eyes too close to the front panel or behind it
+        If the head is at rest, its fixed eye positions are used instead. Eyes behind or too close to the front panel
         are removed.
         """
         if eyes.eyes_m is None:
@@ -127,5 +126,5 @@ class Viewer:
 
 
 def _rest_watch(settings: Settings) -> RestWatch | None:
-    """Create the detector of a resting head, or return None if `plan.enabled` is off."""
+    """Create a detector for a head at rest, or return None if `plan.enabled` is off."""
     return RestWatch(max_drift_m=MAX_REST_DRIFT_M) if settings.plan.enabled else None

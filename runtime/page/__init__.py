@@ -1,1 +1,1 @@
-"""The operator's page, served by a separate process that controls the daemon through a socket."""
+"""The operator's page, served by a separate process that controls the daemon over a socket."""

@@ -1,4 +1,4 @@
-"""Limit the connections of a uvicorn server, because idle connections must not block others."""
+"""Limit a uvicorn server's connections, because idle connections must not block others."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ CONNECTIONS_MAX = 64  # maximum number of simultaneous connections
 
 
 class LimitedConnection(H11Protocol):
-    """HTTP connection that is closed if it waits for a request `REQUEST_S` after it was opened.
+    """HTTP connection that is closed if it is still waiting for a request `REQUEST_S` after opening.
 
-    If there are more than `CONNECTIONS_MAX` connections, the oldest connection that waits for a request is closed.
+    If there are more than `CONNECTIONS_MAX` connections, the oldest one that is waiting for a request is closed.
     """
 
     def connection_made(self, transport: Any) -> None:
@@ -28,7 +28,7 @@ class LimitedConnection(H11Protocol):
         self._timer: asyncio.TimerHandle = self.loop.call_later(REQUEST_S, self._let_go)
         if len(self.connections) > CONNECTIONS_MAX:
             waiting = [one for one in self.connections if isinstance(one, LimitedConnection) and one.waits]
-            min(waiting, key=lambda one: one.made_s).transport.abort()  # may be this connection
+            min(waiting, key=lambda one: one.made_s).transport.abort()  # perhaps this one
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._timer.cancel()
@@ -36,24 +36,24 @@ class LimitedConnection(H11Protocol):
 
     @property
     def waits(self) -> bool:
-        """True if the connection waits for a request."""
+        """True if the connection is waiting for a request."""
         cycle: Any = self.cycle  # None before the first request
         return cycle is None or bool(cycle.response_complete)
 
     def _let_go(self) -> None:
-        if self.waits and self in self.connections:  # a connection upgraded to another protocol is not in the set
+        if self.waits and self in self.connections:  # not if it has been upgraded to another protocol
             self.transport.abort()
 
 
 def listening(command: str, port: int) -> sockets.socket:
-    """Return a socket that listens on a port of the loopback interface.
+    """Return a socket that listens on a loopback port.
 
     Args:
-        command: Name of the command for error messages.
+        command: Command name, for error messages.
         port: Port number.
 
     Raises:
-        InputError: The port cannot be used, for example because another program uses it.
+        InputError: The port cannot be used, for example because another program is using it.
     """
     try:
         return sockets.create_server((LOOPBACK, port))
@@ -62,7 +62,7 @@ def listening(command: str, port: int) -> sockets.socket:
 
 
 def server_of(application: Any) -> uvicorn.Server:
-    """Return a uvicorn server for an ASGI application, with the limits that all pages share."""
+    """Return a uvicorn server for an ASGI application, with the limits used for all pages."""
     return uvicorn.Server(
         uvicorn.Config(
             application,

@@ -1,4 +1,4 @@
-"""Serve the WebSocket of a live page, which sends eye positions and receives layers and refreshes."""
+"""Serve a live page's WebSocket. The page sends eye positions and receives layers and refreshes."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from runtime.optics.retina import as_codes
 from runtime.records import F32, U8
 from runtime.support.artifacts import to_json
 
-PAGES_MAX = 8  # maximum number of live pages, which is limited because every page receives pictures
+PAGES_MAX = 8  # maximum number of live pages, because pictures are sent to each of them
 RANGES = {"noise_mm": (0.0, 50.0), "latency_ms": (0.0, 1000.0), "camera_fov_deg": (20.0, 150.0)}
-RANGES |= {"gap_mm": (1.0, 500.0), "camera": (0.0, 1.0)}  # a change of these values restarts the refresh loop
+RANGES |= {"gap_mm": (1.0, 500.0), "camera": (0.0, 1.0)}  # changing either of these restarts the refresh loop
 
 
 async def live(socket: WebSocket, link: BrowserLink, *, protocol: str | None) -> None:
-    """Serve an authorised page until the page disconnects.
+    """Serve an authorised page until it disconnects.
 
     Args:
-        socket: WebSocket that has not been accepted yet.
+        socket: WebSocket, not accepted yet.
         link: Link to the refresh loop.
-        protocol: WebSocket subprotocol to confirm to the page, or None if the page has not offered it.
+        protocol: WebSocket subprotocol to confirm, or None if the page did not offer it.
     """
     if len(link.news) >= PAGES_MAX:
         await socket.close(1013, "too many pages are open")
@@ -54,22 +54,22 @@ async def live(socket: WebSocket, link: BrowserLink, *, protocol: str | None) ->
 
 
 def _tell(loop: asyncio.AbstractEventLoop, news: asyncio.Event) -> None:
-    with contextlib.suppress(RuntimeError):  # the server's event loop has ended
+    with contextlib.suppress(RuntimeError):  # the server's event loop may have ended
         loop.call_soon_threadsafe(news.set)
 
 
 class _Page:
-    """Sends data to one page and receives messages from the page.
+    """Sends data to one page and receives its messages.
 
-    The page receives new layers only after it has drawn the previous layers.
+    New layers are sent only after the page has drawn the previous ones.
     """
 
     def __init__(self, socket: WebSocket, link: BrowserLink) -> None:
         self._socket, self._link = socket, link
         self.news, self._sent = asyncio.Event(), {"solved": 0, "flat": 0}
-        self._under_way = False  # True while the page has not drawn the last layers yet
+        self._under_way = False  # True while the page has not drawn the latest layers
         self._stack: Any = None
-        self._checks, self._moment = False, None  # _checks: True to send the newest measured refresh, not the live one
+        self._checks, self._moment = False, None  # _checks: send the latest measured refresh, not the live one
 
     async def send(self, me: object) -> None:
         sent: dict[str, Any] = {}
@@ -100,13 +100,13 @@ class _Page:
             self.news.clear()
 
     async def _send_layers(self, kind: str, layers: U8, relief: F32 | None, solved_for_m: Any) -> None:
-        """Send RGBA layers and, if the relief of their content is known, the relief as 16-bit floats.
+        """Send RGBA layers and, if their content's relief is known, the relief as 16-bit floats.
 
         Args:
             kind: `solved` for a solution, or `flat` for the flat picture.
-            layers: (N, h, w, 4) layers.
-            relief: (h, w) relief of the content.
-            solved_for_m: (2, 3) eyes that the layers were solved for, in frame `stack`.
+            layers: Layers, shape (N, h, w, 4).
+            relief: The content's relief, shape (h, w).
+            solved_for_m: Eyes that the layers were solved for, shape (2, 3), in the `stack` frame.
         """
         data = await asyncio.to_thread(lambda: layers.tobytes() + (b"" if relief is None else half_floats(relief)))
         message = {"layers": kind, "solved_for_m": solved_for_m, "size": layers.shape[2:0:-1]}
@@ -114,7 +114,7 @@ class _Page:
         await self._socket.send_bytes(data)
 
     async def _send_moment(self, moment: Any) -> None:
-        """Send the layers of a measured refresh and the target pictures of the two eyes, all as RGBA."""
+        """Send a measured refresh's layers and both eyes' target pictures, all as RGBA."""
         views = moment.eye_views
 
         def packed() -> bytes:

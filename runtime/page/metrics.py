@@ -1,4 +1,4 @@
-"""Format the figures of the daemon's status as text for Prometheus, under their JSON names."""
+"""Format the figures in the daemon's status as Prometheus text, using their JSON names."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from typing import Any
 
 PREFIX = "phasestack_"
 COUNTERS = ("presented", "dropped", "stale_inputs", "inferences", "missed_blanks")
-TABLES = {"efforts": "effort", "faults": "part", "rejected_samples": "reason"}  # name of the label, by field
+TABLES = {"efforts": "effort", "faults": "part", "rejected_samples": "reason"}  # label name, keyed by field
 TEXTS = ("state", "effort", "model", "scene")
 
 
 def exposition(status: Mapping[str, Any]) -> str:
-    """Format the numbers and the known texts of a status in the text format of Prometheus.
+    """Format a status's numbers and known texts in the Prometheus text format.
 
-    Quantiles, the entries of tables, and texts become labels. Null values are skipped.
+    Quantiles, table entries and texts become labels. Null values are skipped.
     """
     return "".join(f"{line}\n" for line in _lines(status))
 
@@ -36,9 +36,9 @@ def _lines(status: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _key(field: str, key: str) -> str:
-    """Return the label of an entry of a dictionary in the status.
+    """Return the label for an entry of one of the status's dictionaries.
 
-    The key `p95` stands for the quantile 0.95, and `max` for the quantile 1.
+    The key `p95` stands for quantile 0.95, and `max` for quantile 1.
     """
     if field in TABLES:
         return _label(TABLES[field], key)

@@ -1,7 +1,7 @@
-"""Web application of the operator's page.
+"""Web application for the operator's page.
 
-All access to the daemon requires a token, which the script of the page stores (`session.js`) and sends with every
-request. Other sites and ports cannot read the token. Their requests cannot carry the token, because it is not a cookie.
+The daemon can be reached only with a token, which the page's script stores (`session.js`) and sends with every request.
+The token cannot be read from other sites or ports, and because it is not a cookie, their requests do not carry it.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from runtime.support.untrusted_input import parsed_json
 
 SCRIPT, STYLE = "text/javascript", "text/css"
 PROTOCOL = "phasestack"  # WebSocket subprotocol
-METRICS = "text/plain; version=0.0.4; charset=utf-8"  # media type of the text format of Prometheus
+METRICS = "text/plain; version=0.0.4; charset=utf-8"  # media type of the Prometheus text format
 ASSETS = {"page.css": STYLE, "look.css": STYLE}
 ASSETS |= dict.fromkeys(("session.js", "page.js", "display.js", "look.js", "try.js"), SCRIPT)
 HEADERS = {
@@ -51,23 +51,23 @@ Handler = Callable[[Request], Awaitable[Response]]
 
 
 class JsonAnswer(JSONResponse):
-    """JSON response in pure ASCII, because file names in the response may not be valid UTF-8."""
+    """JSON response in pure ASCII, because it may contain file names that are not valid UTF-8."""
 
     def render(self, content: Any) -> bytes:
         return to_json(content).encode()
 
 
 class TooLong(ValueError):
-    """Raised if the body of a request is longer than `REQUEST_MAX_BYTES`."""
+    """Raised if a request's body is longer than `REQUEST_MAX_BYTES`."""
 
 
 def application(daemon: DaemonClient, token: str, *, link: BrowserLink | None = None) -> Starlette:
-    """Create the web application, whose server must listen on loopback only.
+    """Create the web application. Its server must listen only on loopback.
 
     Args:
-        daemon: Client that connects to the daemon.
-        token: Token that requests must carry.
-        link: Link to the refresh loop if the page itself is the display. None for the operator's page alone.
+        daemon: Client for talking to the daemon.
+        token: Token required in every request.
+        link: Link to the refresh loop if the page is itself the display. None to serve only the operator's page.
     """
 
     def permitted(request: HTTPConnection) -> bool:
@@ -89,7 +89,7 @@ def application(daemon: DaemonClient, token: str, *, link: BrowserLink | None = 
         return HTMLResponse(_asset("page.html"))
 
     async def connected(socket: WebSocket) -> None:
-        # The list of protocols is the only header of a WebSocket request that a script can set in a browser.
+        # In a browser, the list of protocols is the only WebSocket request header that a script can set.
         offered = [one.strip() for one in socket.headers.get("sec-websocket-protocol", "").split(",")]
         if link is None or not (permitted(socket) or any(same(one, token) for one in offered)):
             await socket.close(1008)
@@ -142,18 +142,18 @@ def application(daemon: DaemonClient, token: str, *, link: BrowserLink | None = 
 
 
 async def _guard(request: Request, handler: Handler) -> Response:
-    """Add security headers to the answer of a request."""
+    """Answer a request, adding security headers."""
     answer = await handler(request)
     answer.headers.update(HEADERS)
     return answer
 
 
 async def _body(request: Request) -> bytes:
-    """Return the body of a request.
+    """Return a request's body.
 
     Raises:
         TooLong: The body is longer than `REQUEST_MAX_BYTES`.
-        ValueError: The client disconnects or the body does not arrive within `REQUEST_S`.
+        ValueError: The client disconnects, or the body does not arrive within `REQUEST_S`.
     """
     received = b""
     try:

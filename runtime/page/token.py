@@ -1,4 +1,4 @@
-"""Store the token of the operator's page in a file that only the owner of the file can read."""
+"""Store the token for the operator's page in a file that only its owner can read."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from pathlib import Path
 from runtime.errors import InputError
 
 TOKEN_BYTES = 32  # length of a new token
-LEAST_CHARACTERS = 16  # minimum length of a token; shorter tokens could be guessed
-MOST_BYTES = 4096  # maximum number of bytes that are read from the file
+LEAST_CHARACTERS = 16  # minimum length of a token; a shorter one could be guessed
+MOST_BYTES = 4096  # maximum number of bytes read from the file
 
 
 def token_of(path: Path) -> str:
-    """Read the token from a file, or create the file with a new token if the file does not exist.
+    """Read the token from a file. If the file does not exist, create it with a new token.
 
     Raises:
-        InputError: The file cannot be created or read, is accessible to other users, or contains no valid token.
+        InputError: The file cannot be created or read, other users can access it, or it does not contain a valid token.
     """
     token, name = secrets.token_urlsafe(TOKEN_BYTES), ""
     try:
@@ -32,7 +32,7 @@ def token_of(path: Path) -> str:
             os.link(name, path)  # atomic
             return token
     except FileExistsError:
-        pass  # another process has created the file in the meantime
+        pass  # created by another process in the meantime
     except OSError as error:
         raise InputError(path, "", f"cannot be created ({error.strerror})") from None
     finally:

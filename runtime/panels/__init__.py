@@ -1,1 +1,1 @@
-"""Outputs to the panels (offscreen, windows, browser), the presentation shader, and monitors."""
+"""Outputs to the panels (offscreen, windows, browser), the presentation shader, and monitor queries."""

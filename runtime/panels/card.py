@@ -1,4 +1,4 @@
-"""Test card of `phasestack identify`, which shows a panel's index, orientation, colours and edges."""
+"""Test card for `phasestack identify` that shows a panel's index, orientation, colours and edges."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 def identity_card(width_px: int, height_px: int, *, title: str, lines: Sequence[str]) -> U8:
-    """Draw a test card (height_px, width_px, 4) with text, an upward arrow, colour bars and grey steps.
+    """Draw a (height_px, width_px, 4) test card with text, an upward arrow, colour bars and grey steps.
 
-    The card has a line one pixel wide along every edge. If one of these lines is invisible, the panel is cropped or
-    misaligned. The text is placed away from the edges, because nearby viewers see the rim of the front panel without a
-    lit panel behind it.
+    A line one pixel wide runs along each edge. If any of these lines cannot be seen, the panel is cropped or
+    misaligned. The text is kept away from the edges, because to a nearby viewer the rim of the front panel has no lit
+    panel behind it.
     """
     card = np.empty((height_px, width_px, 4), np.uint8)
     card[:] = PAPER
@@ -42,7 +42,7 @@ def identity_card(width_px: int, height_px: int, *, title: str, lines: Sequence[
 
 
 def alone(cards: Sequence[U8], index: int) -> U8:
-    """Return layers (N, H, W, 4) that show the card of panel `index` alone and zero on all other panels."""
+    """Return layers (N, H, W, 4) with the card for panel `index`, and with zeros on all other panels."""
     layers = np.zeros((len(cards), *cards[index].shape), np.uint8)
     layers[..., 3] = 255
     layers[index] = cards[index]
@@ -68,7 +68,7 @@ def _arrow(card: U8, *, x_px: int, top: int, bottom: int, unit: float) -> None:
 
 
 def _text(card: U8, text: str, *, x_px: int, y_px: int, height: float, room: float) -> None:
-    # OpenCV's Hershey fonts contain only ASCII.
+    # OpenCV's Hershey fonts cover only ASCII.
     plain = text.encode("ascii", "replace").decode()
     (full, tall), _ = cv2.getTextSize(plain, FONT, 1.0, 1)
     scale = min(height / tall, room / max(full, 1))

@@ -1,6 +1,6 @@
-"""List monitors and open windows that share GL objects, with GLFW on X11.
+"""List monitors, and open windows that share GL objects, using GLFW on X11.
 
-The module may be used only on the main thread.
+For use only on the main thread.
 """
 
 from __future__ import annotations
@@ -21,33 +21,33 @@ from runtime.support.gl import MINIMUM_VERSION
 
 log = logging.getLogger("phasestack.panels")
 
-glfw: Any = _glfw  # untyped, because the stubs of GLFW are wrong about bytes, None and pointers
+glfw: Any = _glfw  # untyped, because GLFW's stubs are wrong about bytes, None and pointers
 
-# By default, the binding turns errors into warnings.
+# By default, the Python binding turns errors into warnings.
 glfw.ERROR_REPORTING = "exception"
 
 
 @cache
 def gl_function(name: str) -> int:
-    """Return the address of an OpenGL function, or 0 if the function is missing.
+    """Return an OpenGL function's address, or 0 if there is no such function.
 
-    The address is the same in all contexts. Addresses are cached, because moderngl keeps references to all functions,
-    which would otherwise take 20 KiB per context.
+    The address is the same in all contexts. It is cached because moderngl keeps references to all functions, which
+    would otherwise take 20 KiB per context.
     """
     return int(glfw.get_proc_address(name) or 0)
 
 
 class WindowContext:
-    """Gives moderngl access to the GL context of a GLFW window.
+    """Gives moderngl access to a GLFW window's GL context.
 
-    moderngl uses the adapter to load OpenGL functions and to make the context current.
+    moderngl uses this adapter to load OpenGL functions and to make the context current.
     """
 
     def __init__(self, window: Any) -> None:
         self._window = window
 
     def load_opengl_function(self, name: str) -> int:
-        """Return the address of an OpenGL function, or 0 if the function is missing."""
+        """Return an OpenGL function's address, or 0 if there is no such function."""
         return gl_function(name)
 
     load = load_opengl_function
@@ -59,30 +59,30 @@ class WindowContext:
         """Leave the context current."""
 
     def release(self) -> None:
-        """Do nothing, because the window owns the context."""
+        """Do nothing, because the context belongs to the window."""
 
 
 @dataclass(eq=False)
 class Window:
-    """GLFW window with its moderngl context."""
+    """A GLFW window and its moderngl context."""
 
     handle: Any
     context: moderngl.Context
-    faults: list[str] = field(default_factory=list)  # faults that callbacks have reported
+    faults: list[str] = field(default_factory=list)  # faults reported by callbacks
 
     def make_current(self) -> None:
         """Make the window's context current on this thread."""
         glfw.make_context_current(self.handle)
 
 
-watch: xlib.ServerWatch | None = None  # watch on the connection of this process to the X server
+watch: xlib.ServerWatch | None = None  # watches this process's connection to the X server
 
 
 def _connect() -> None:
-    """Connect GLFW to the X server for the remaining life of the process.
+    """Connect GLFW to the X server until the process ends.
 
-    The connection stays open because another thread may still use a context of the same EGL display after the panels
-    have lost their contexts. If GLFW closed this EGL display, Mesa would access freed memory.
+    The connection is kept open because, after the panels have lost their contexts, another thread may still be using a
+    context of the same EGL display. If GLFW closed the EGL display, Mesa would access freed memory.
 
     Raises:
         PanelLost: No X server can be reached.
@@ -90,7 +90,7 @@ def _connect() -> None:
     """
     global watch
     if watch is not None:
-        glfw.poll_events()  # updates the list of monitors
+        glfw.poll_events()  # this updates the list of monitors
         return
     try:
         if glfw.platform_supported(glfw.PLATFORM_X11):
@@ -105,9 +105,9 @@ def _connect() -> None:
 
 
 class Display:
-    """Opens and closes windows on the X server, and lists its monitors.
+    """Opens and closes windows on the X server, and lists the monitors.
 
-    A hidden root window owns the GL objects that all other windows share. If the X server dies, the process ends (see
+    A hidden root window owns the GL objects shared by all other windows. If the X server dies, the process ends (see
     `xlib.take_over_errors`).
     """
 
@@ -126,9 +126,9 @@ class Display:
 
     @property
     def root(self) -> Window:
-        """Hidden root window.
+        """The hidden root window.
 
-        The window is created on first use, because listing monitors requires no OpenGL.
+        Created on first use, because listing monitors does not require OpenGL.
 
         Raises:
             PanelLost: The X server does not support OpenGL.
@@ -143,11 +143,11 @@ class Display:
         return self._windows[0]
 
     def monitors(self) -> tuple[Monitor, ...]:
-        """Return the active monitors from left to right."""
+        """Return the active monitors, sorted from left to right."""
         return in_order([monitor for monitor, _ in self._pairs()])
 
     def fullscreen_window(self, monitor: Monitor, *, title: str) -> Window:
-        """Open a borderless window that fills a monitor, and make the context of the window current.
+        """Open a borderless window that fills a monitor, and make its context current.
 
         Raises:
             PanelLost: The monitor is no longer connected, or the X server does not support OpenGL.
@@ -161,7 +161,7 @@ class Display:
         return self._adopt(handle)
 
     def poll(self) -> str:
-        """Process X events, and return the faults that make the windows unusable or an empty string."""
+        """Process X events, and return any faults that make the windows unusable, or an empty string."""
         glfw.poll_events()
         faults = self.faults + [fault for window in self._windows for fault in window.faults]
         return "; ".join(faults)
@@ -174,7 +174,7 @@ class Display:
             self._windows[0].make_current()
 
     def close(self) -> None:
-        """Close every window, including the hidden root window. The method may be called twice."""
+        """Close every window, including the hidden root window. May be called more than once."""
         if self._windows:
             glfw.make_context_current(None)
         self._close_from(0)
@@ -199,19 +199,19 @@ class Display:
         return window
 
     def output_state(self, connector: str) -> xlib.OutputState | None:
-        """Return the mode and monitor of an output, or None if the output is off or disconnected.
+        """Return an output's mode and monitor, or None if the output is off or disconnected.
 
         Args:
-            connector: Name of the output, such as `DP-1`.
+            connector: The output's name, such as `DP-1`.
         """
         output = self._outputs.get(connector)
         return xlib.output_state(_pointer(), output) if output else None
 
     def window_state(self, window: Window) -> tuple[bool, Rectangle] | None:
-        """Return the state of a window, or None if another program has destroyed the window.
+        """Return a window's state, or None if another program has destroyed it.
 
         Returns:
-            True if the window is mapped, and the region of the X screen that the window covers.
+            True if the window is mapped, and the region of the X screen it covers.
         """
         refused = xlib.refusals()
         place = Rectangle(*glfw.get_window_pos(window.handle), *glfw.get_window_size(window.handle))
@@ -227,7 +227,7 @@ class Display:
             x_px, y_px = glfw.get_monitor_pos(handle)
             state = self.output_state(connector)
             identity = edid.parse(state.edid) if state is not None and state.edid else None
-            # GLFW rounds the refresh rate to an integer.
+            # GLFW's refresh rate is rounded to an integer.
             refresh_hz = state.refresh_hz if state is not None and state.refresh_hz else float(mode.refresh_rate)
             monitor = Monitor(
                 connector=connector,
@@ -248,12 +248,12 @@ class Display:
 
     @property
     def has_windows(self) -> bool:
-        """True if there are windows other than the hidden root window."""
+        """True if any window other than the hidden root window is open."""
         return len(self._windows) > 1
 
 
 def connected_monitors() -> tuple[Monitor, ...]:
-    """Return the active monitors from left to right.
+    """Return the active monitors, sorted from left to right.
 
     Raises:
         PanelLost: No X server can be reached, or no monitor is active.
@@ -276,7 +276,7 @@ def _attach(handle: Any) -> moderngl.Context:
 
 def _hints() -> None:
     glfw.default_window_hints()
-    # The windows use EGL like the offscreen context, because a thread cannot switch between GLX and EGL contexts.
+    # Like the offscreen context, the windows use EGL, because a thread cannot switch between GLX and EGL contexts.
     glfw.window_hint(glfw.CONTEXT_CREATION_API, glfw.EGL_CONTEXT_API)
     glfw.window_hint(glfw.CONTEXT_VERSION_MAJOR, MINIMUM_VERSION // 100)
     glfw.window_hint(glfw.CONTEXT_VERSION_MINOR, MINIMUM_VERSION // 10 % 10)

@@ -1,4 +1,4 @@
-"""Parse the EDID of a monitor (base block of VESA E-EDID 1.3 and 1.4)."""
+"""Parse a monitor's EDID (the base block defined by VESA E-EDID 1.3 and 1.4)."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ SERIAL_TAG, NAME_TAG = 0xFF, 0xFC
 
 @dataclass(frozen=True, slots=True)
 class Edid:
-    """Identity of a monitor from its EDID."""
+    """A monitor's identity, as given by its EDID."""
 
-    maker: str  # three-letter code of the manufacturer
+    maker: str  # the manufacturer's three-letter code
     serial: str  # serial number, unique only among monitors of the same model; empty if unknown
-    name: str  # name of the model; empty if unknown
+    name: str  # model name; empty if unknown
 
 
 def parse(data: bytes) -> Edid | None:
-    """Parse the base block of an EDID, or return None if its length, header or checksum is wrong."""
+    """Parse an EDID's base block, or return None if its length, header or checksum is wrong."""
     block = data[:BLOCK_BYTES]
     if len(block) < BLOCK_BYTES or not block.startswith(HEADER) or sum(block) % 256:
         return None
@@ -29,7 +29,7 @@ def parse(data: bytes) -> Edid | None:
     number = int.from_bytes(block[12:16], "little")
     return Edid(
         maker=maker,
-        # Manufacturers write 0 or 0x01010101 if there is no serial number.
+        # Manufacturers use 0 or 0x01010101 for monitors without a serial number.
         serial=_text(block, SERIAL_TAG) or (str(number) if number not in (0, 0x01010101) else ""),
         name=_text(block, NAME_TAG),
     )

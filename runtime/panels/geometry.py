@@ -1,4 +1,4 @@
-"""Map pixels of a monitor to pixels of a layer, including registration, mirroring and rotation."""
+"""Map monitor pixels to layer pixels, taking registration, mirroring and rotation into account."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from runtime.records import F64
 
 
 def panel_size_px(*, screen_width_px: int, screen_height_px: int, rotation_deg: int) -> tuple[int, int]:
-    """Return the numbers of columns and rows of a panel as the viewer sees it."""
+    """Return a panel's number of columns and of rows, as seen by the viewer."""
     if rotation_deg in (90, 270):
         return screen_height_px, screen_width_px
     return screen_width_px, screen_height_px
 
 
 def panel_from_screen(*, screen_width_px: int, screen_height_px: int, rotation_deg: int, mirror: str) -> F64:
-    """Return the 3x3 matrix from monitor pixels to panel pixels as seen by the viewer.
+    """Return the 3x3 matrix that maps monitor pixels to panel pixels as seen by the viewer.
 
-    The v axis points down in both coordinate systems. If a monitor is mounted with a counter-clockwise rotation of
-    `rotation_deg`, as seen from the front, its picture is rotated clockwise. Mirroring is applied to the viewer's
-    picture before the rotation.
+    In both coordinate systems, v points down. If the mounted monitor is rotated counter-clockwise by `rotation_deg`, as
+    seen from the front, its picture is rotated clockwise to make up for this. Mirroring is applied to the picture as
+    the viewer sees it, before the rotation.
     """
     width, height = float(screen_width_px), float(screen_height_px)
     turned = {
@@ -53,16 +53,16 @@ def layer_from_screen(
     mirror: str,
     homography: Sequence[Sequence[float]],
 ) -> F64:
-    """Return the 3x3 matrix from monitor pixels to layer pixels, up to scale.
+    """Return the 3x3 matrix that maps monitor pixels to layer pixels, up to scale.
 
     Args:
-        screen_width_px: Width of the monitor.
-        screen_height_px: Height of the monitor.
-        layer_width_px: Width of the layers, which may differ from the width of the panel.
-        layer_height_px: Height of the layers, which may differ from the height of the panel.
-        rotation_deg: Counter-clockwise rotation of the mounted monitor, as seen from the front.
-        mirror: Mirroring of the viewer's picture, which is `none`, `horizontal` or `vertical`.
-        homography: 3x3 matrix from ideal to actual pixels, at the resolution of the panel.
+        screen_width_px: The monitor's width.
+        screen_height_px: The monitor's height.
+        layer_width_px: The layers' width, which may differ from the panel's.
+        layer_height_px: The layers' height, which may differ from the panel's.
+        rotation_deg: Angle by which the mounted monitor is rotated counter-clockwise, as seen from the front.
+        mirror: How to mirror the picture that the viewer sees: `none`, `horizontal` or `vertical`.
+        homography: 3x3 matrix that maps ideal to actual pixels, at the panel's resolution.
 
     Raises:
         ValueError: The homography is singular or not finite.
@@ -84,7 +84,7 @@ def layer_from_screen(
 def permutes_pixels(matrix: F64) -> bool:
     """Return True if a 3x3 matrix maps pixel centres to pixel centres.
 
-    Pictures mapped with such a matrix need no interpolation.
+    A picture mapped by such a matrix needs no interpolation.
     """
     if matrix[2, 2] == 0.0:
         return False
@@ -103,14 +103,14 @@ DIRECTIONS: dict[Arrow, tuple[int, int]] = {"up": (0, -1), "down": (0, 1), "left
 
 
 def mounting_of(arrow: Arrow, *, mirrored: bool) -> tuple[int, str]:
-    """Return `rotation_deg` and `mirror` of a panel from the appearance of its test card.
+    """Determine a panel's `rotation_deg` and `mirror` from how its test card looks.
 
     Args:
-        arrow: Direction in which the card's arrow points, as seen by the viewer.
-        mirrored: True if the card's text appears mirrored.
+        arrow: Direction of the arrow on the card, as seen by the viewer.
+        mirrored: True if the text on the card appears mirrored.
 
     Raises:
-        ValueError: No mounting produces this direction.
+        ValueError: The arrow cannot point in this direction, however the panel is mounted.
     """
     mirror = "horizontal" if mirrored else "none"
     for rotation_deg in ROTATIONS:

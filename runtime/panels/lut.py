@@ -1,4 +1,4 @@
-"""Grey curves, which map the phase that a panel should produce to the grey level to display."""
+"""Grey curves, which map the phase wanted from a panel to the grey level to display."""
 
 from __future__ import annotations
 
@@ -15,17 +15,18 @@ COLUMNS = ("phase", "red", "green", "blue")
 
 
 def measured_curve(path: Path) -> F32:
-    """Read a measured grey curve from a CSV file.
+    """Read a grey curve, as measured, from a CSV file.
 
-    The file has the columns phase, red, green and blue, or phase and grey. All values are in [0, 1]. There must be at
-    least two rows, with ascending phases. The curve is linear between the rows and constant beyond the first and the
-    last row.
+    The columns are either phase, red, green and blue, or phase and grey, with all values in [0, 1]. There must be at
+    least two rows, in order of increasing phase. The curve is linear between rows, and constant before the first row
+    and after the last.
 
     Returns:
-        Grey levels (256, 3) in [0, 1] by 8-bit phase and colour channel.
+        Grey levels in [0, 1], shape (256, 3), indexed by 8-bit phase and colour channel.
 
     Raises:
-        InputError: The file cannot be read or its content is invalid. The message names the file and the fault.
+        InputError: The file cannot be read or its content is invalid. The message names the file and says what is
+            wrong.
     """
     lines = [line for line in untrusted_input.read_text(path).splitlines() if line.strip() and line[0] != "#"]
     header = tuple(name.strip().lower() for name in lines[0].split(",")) if lines else ()
@@ -49,11 +50,11 @@ def measured_curve(path: Path) -> F32:
 
 
 def curve(*, lut: str, gamma: float) -> F32:
-    """Return the grey levels (256, 3) in [0, 1] of a panel by 8-bit phase and colour channel.
+    """Return a panel's grey levels in [0, 1], shape (256, 3), indexed by 8-bit phase and colour channel.
 
     Args:
-        lut: CSV file with a measured curve. If empty, the curve follows phase = grey^gamma.
-        gamma: Exponent of the curve if there is no file.
+        lut: CSV file that contains a measured curve. If empty, the curve follows phase = grey^gamma.
+        gamma: The curve's exponent if there is no file.
 
     Raises:
         InputError: The file cannot be read or its content is invalid.

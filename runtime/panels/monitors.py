@@ -1,6 +1,6 @@
-"""Assign monitors to panels by EDID serial number or connector, and check the modes of the monitors.
+"""Assign a monitor to each panel by EDID serial number or connector, and check the monitors' modes.
 
-The assignment never guesses a monitor, and pictures are never rescaled, because phases must reach the panels unchanged.
+Monitors are never guessed. Pictures are never rescaled, because the phases must reach the panels unchanged.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from runtime.config import PanelSettings
 from runtime.errors import InputError, PanelLost
 from runtime.panels.geometry import panel_size_px
 
-REFRESH_TOLERANCE_HZ = 0.05  # panels at 59.94 Hz and 60 Hz would drift apart by a frame in 17 s
+REFRESH_TOLERANCE_HZ = 0.05  # two panels at 59.94 Hz and 60 Hz would drift apart by a frame every 17 s
 
 
 class Rectangle(NamedTuple):
-    """Region of the X screen, in pixels from the top left corner of the screen."""
+    """A region of the X screen, in pixels from the screen's top left corner."""
 
     x_px: int
     y_px: int
@@ -30,25 +30,25 @@ class Rectangle(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Monitor:
-    """Active monitor on the X screen."""
+    """An active monitor on the X screen."""
 
     connector: str
-    serial: str  # serial number from the EDID; empty if unknown
-    model: str  # manufacturer and name from the EDID; empty if unknown
-    x_px: int  # column of the monitor's top left corner on the X screen
-    y_px: int  # row of the monitor's top left corner on the X screen
+    serial: str  # serial number in the EDID; empty if unknown
+    model: str  # manufacturer and name in the EDID; empty if unknown
+    x_px: int  # the top left corner's column on the X screen
+    y_px: int  # the top left corner's row on the X screen
     width_px: int
     height_px: int
-    refresh_hz: float  # 0 if the refresh rate is unknown
+    refresh_hz: float  # 0 if unknown
 
     @property
     def place(self) -> Rectangle:
-        """Region of the X screen that the monitor shows."""
+        """The region of the X screen shown on this monitor."""
         return Rectangle(self.x_px, self.y_px, self.width_px, self.height_px)
 
     @property
     def setting(self) -> str:
-        """Line of the configuration that identifies this monitor in `[[output.panels]]`."""
+        """Configuration line that selects this monitor in `[[output.panels]]`."""
         return f'edid_serial = "{self.serial}"' if self.serial else f'connector = "{self.connector}"'
 
     def __str__(self) -> str:
@@ -58,23 +58,23 @@ class Monitor:
 
 
 def in_order(monitors: Sequence[Monitor]) -> tuple[Monitor, ...]:
-    """Sort monitors from left to right, then from top to bottom."""
+    """Return the monitors sorted from left to right, then from top to bottom."""
     return tuple(sorted(monitors, key=lambda monitor: (monitor.x_px, monitor.y_px, monitor.connector)))
 
 
 def bind(panels: Sequence[PanelSettings], monitors: Sequence[Monitor]) -> tuple[Monitor, ...]:
-    """Return the monitor of each panel.
+    """Find each panel's monitor.
 
-    If the settings of a panel give a serial number and a connector, the monitor must match the two criteria. The
-    connector distinguishes monitors with equal serial numbers.
+    If a panel's settings give both a serial number and a connector, the monitor must match both. The connector is
+    needed if several monitors have the same serial number.
 
     Args:
-        panels: Settings of the panels, rear to front.
-        monitors: Connected monitors in any order.
+        panels: Panel settings, rear to front.
+        monitors: The connected monitors, in any order.
 
     Raises:
-        InputError: The settings of a panel give neither a serial number nor a connector.
-        PanelLost: The monitor of a panel is missing, ambiguous or already assigned. The failure may be temporary.
+        InputError: A panel's settings give neither a serial number nor a connector.
+        PanelLost: A panel's monitor is missing, ambiguous or already assigned. This may be temporary.
     """
     ordered = in_order(monitors)
     bound: list[Monitor] = []
@@ -109,9 +109,9 @@ def _find(number: int, panel: PanelSettings, monitors: tuple[Monitor, ...]) -> M
 
 
 def check_modes(panels: Sequence[PanelSettings], monitors: Sequence[Monitor], *, width_px: int, height_px: int) -> None:
-    """Raise PanelLost if the resolution of a monitor differs from that of the stack.
+    """Raise PanelLost if any monitor's resolution differs from the stack's.
 
-    Rescaling would mix the phases of neighbouring pixels and destroy the pictures for both eyes.
+    Rescaling would mix the phases of neighbouring pixels and so ruin both eyes' pictures.
     """
     for number, (panel, monitor) in enumerate(zip(panels, monitors, strict=True)):
         columns, rows = panel_size_px(
@@ -126,7 +126,7 @@ def check_modes(panels: Sequence[PanelSettings], monitors: Sequence[Monitor], *,
 
 
 def refresh_difference(monitors: Sequence[Monitor]) -> str:
-    """Return a warning in one line if the known refresh rates differ, otherwise an empty string."""
+    """Return a one-line warning if the known refresh rates differ, or an empty string."""
     known = [monitor for monitor in monitors if monitor.refresh_hz > 0]
     rates = [monitor.refresh_hz for monitor in known]
     if not rates or max(rates) - min(rates) <= REFRESH_TOLERANCE_HZ:

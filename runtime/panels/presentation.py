@@ -1,4 +1,4 @@
-"""Align a layer, mix it with the flat picture and draw it to a panel, with the presentation shader."""
+"""Use the presentation shader to align a layer, mix it with the flat picture and draw it to a panel."""
 
 from __future__ import annotations
 
@@ -29,11 +29,12 @@ void main() {
 }
 """
 
-# The reference for `shown` is runtime.optics.alignment.shown_layers. Aligned layers are sampled with weights of full
-# precision, because hardware filters have steps of 1/256. Outside the layers, the samples have the rest value. Layers
-# moved by a homography are sampled once for registration and alignment together, with cubic weights. Bilinear weights
-# would lose another 0.15 dB. Each case has a separate program, because a software rasteriser executes both branches of
-# every `if`. A single program for all cases would take several times as long as the slowest of the separate programs.
+# The reference for `shown` is runtime.optics.alignment.shown_layers. Aligned layers are sampled with full-precision
+# weights, because hardware filters round them to steps of 1/256. Outside the layers, the rest value is sampled. If a
+# homography moves the layers, they are sampled once for registration and alignment together, using cubic weights,
+# because bilinear weights would lose another 0.15 dB. Each case has its own program, because a software rasteriser
+# executes both branches of every `if`: a single program for all cases would take several times as long as the slowest
+# of these.
 FRAGMENT = """
 uniform sampler2D solved;        // this panel's layer of the solution
 uniform sampler2D flat_picture;
@@ -140,7 +141,7 @@ void main() {
 """
 
 
-Case = tuple[str, ...]  # macros defined for the fragment shader
+Case = tuple[str, ...]  # macros to define in the fragment shader
 CASES: tuple[Case, ...] = (
     (),
     *(("SOLVED", *how, *mixed) for how in ((), ("ALIGNED",), ("ALIGNED", "DISPLACED")) for mixed in ((), ("MIXED",))),
@@ -148,37 +149,37 @@ CASES: tuple[Case, ...] = (
 
 
 class FrameTextures:
-    """Uploads the layers of the newest frame to textures whenever the version of the layers changes."""
+    """Uploads the latest frame's layers to textures whenever their version changes."""
 
     def __init__(self, context: moderngl.Context, size_px: tuple[int, int], *, count: int) -> None:
         """Create an empty set of textures.
 
         Args:
             context: GL context that owns the textures.
-            size_px: Width and height of a panel.
+            size_px: A panel's width and height.
             count: Number of panels.
         """
         self._context = context
         self.size_px, self.count = size_px, count
-        self._textures: dict[tuple[str, tuple[int, int]], tuple[moderngl.Texture, ...]] = {}  # by kind and size
+        self._textures: dict[tuple[str, tuple[int, int]], tuple[moderngl.Texture, ...]] = {}  # keyed by kind and size
         self._solved: tuple[moderngl.Texture, ...] = ()
         self._flat: tuple[moderngl.Texture, ...] = ()
-        self._reliefs: dict[tuple[int, int], moderngl.Texture] = {}  # by size
-        self._relief: moderngl.Texture | None = None  # relief of the uploaded solution
+        self._reliefs: dict[tuple[int, int], moderngl.Texture] = {}  # keyed by size
+        self._relief: moderngl.Texture | None = None  # the uploaded solution's relief
         self._solved_version: int | None = None
         self._flat_version: int | None = None
 
     @property
     def solved_px(self) -> tuple[int, int]:
-        """Width and height of the uploaded solution, or of a panel if no solution has been uploaded."""
+        """The uploaded solution's width and height, or a panel's if no solution has been uploaded."""
         return self._solved[0].size if self._solved else self.size_px
 
     def lacks(self, frame: PanelFrame) -> tuple[bool, bool]:
-        """Check which pictures of a frame must be uploaded before the frame can be drawn.
+        """Check which of a frame's pictures must be uploaded before the frame can be drawn.
 
         Returns:
-            Two flags, for the solution and the flat picture. A flag is True if the picture is visible in the frame but
-            has not been uploaded.
+            Two flags, one for the solution and one for the flat picture. Each is True if that picture is visible in the
+            frame but has not been uploaded.
         """
         return (
             shows_solved(frame) and frame.solved_version != self._solved_version,
@@ -186,10 +187,10 @@ class FrameTextures:
         )
 
     def upload(self, frame: PanelFrame) -> None:
-        """Upload the pictures that are visible in a frame and have not been uploaded yet."""
+        """Upload whichever pictures are visible in a frame and have not been uploaded yet."""
         lacks_solved, lacks_flat = self.lacks(frame)
         if lacks_solved and frame.solved is not None:
-            self._solved_version = None  # remains None if the upload fails
+            self._solved_version = None  # stays None if the upload fails
             self._solved = self._written("solved", frame.solved)
             self._relief = None if frame.relief is None else self._relief_of(frame.relief)
             self._solved_version = frame.solved_version
@@ -199,7 +200,7 @@ class FrameTextures:
             self._flat_version = frame.flat_version
 
     def use(self, index: int) -> None:
-        """Bind the textures of one panel to the texture units that `Painter` reads, in the current context."""
+        """Bind one panel's textures to the texture units read by `Painter`, in the current context."""
         for unit, uploaded in enumerate((self._solved, self._flat)):
             if uploaded:
                 uploaded[index].use(unit)
@@ -224,9 +225,9 @@ class FrameTextures:
         return self._reliefs[key]
 
     def _written(self, kind: str, layers: U8) -> tuple[moderngl.Texture, ...]:
-        """Write layers to textures, one per panel, and return the textures.
+        """Write layers to textures, one for each panel, and return the textures.
 
-        The textures are created when layers of their size are written for the first time.
+        The first time that layers of a given size are written, the textures are created.
         """
         key = kind, (layers.shape[2], layers.shape[1])
         if key not in self._textures:
@@ -250,9 +251,9 @@ def shows_flat(frame: PanelFrame) -> bool:
 
 
 class Painter:
-    """Draws frames to one panel with the presentation shader.
+    """Draws frames to one panel using the presentation shader.
 
-    Vertex arrays cannot be shared between GL contexts, so each window needs its own painter.
+    Each window needs its own painter, because vertex arrays cannot be shared between GL contexts.
     """
 
     def __init__(
@@ -266,13 +267,13 @@ class Painter:
         """Compile the shader for one panel.
 
         Args:
-            context: GL context of the panel's window.
-            settings: Settings of the panel.
-            screen_px: Width and height of the monitor.
-            layer_px: Width and height of a panel of the stack.
+            context: The GL context of the panel's window.
+            settings: The panel's settings.
+            screen_px: The monitor's width and height.
+            layer_px: Width and height of each of the stack's panels.
 
         Raises:
-            InputError: The file with the grey curve cannot be read or is invalid.
+            InputError: The grey curve's file cannot be read or is invalid.
             ValueError: The homography is singular or not finite.
         """
         matrix = layer_from_screen(
@@ -284,7 +285,8 @@ class Painter:
             mirror=settings.mirror,
             homography=settings.homography,
         )
-        # The sign of a homography is arbitrary. The shader requires a positive third coordinate at the panel's centre.
+        # A homography's sign is arbitrary, but the shader needs the third coordinate to be positive at the panel's
+        # centre.
         matrix = matrix / (matrix[2] @ np.array([screen_px[0] / 2, screen_px[1] / 2, 1.0]))
         mounting = ["EXACT"] * permutes_pixels(matrix) + ["CURVED"] * bool(settings.lut or settings.gamma != 1)
         table = np.ascontiguousarray(lut.curve(lut=settings.lut, gamma=settings.gamma).T)
@@ -298,12 +300,12 @@ class Painter:
         self._cases = {case: _compiled(context, (*mounting, *case), fixed) for case in CASES}
 
     def draw(self, textures: FrameTextures, frame: PanelFrame, index: int) -> None:
-        """Draw one panel of an uploaded frame to the bound framebuffer.
+        """Draw an uploaded frame's picture for one panel to the bound framebuffer.
 
         Args:
-            textures: Textures that contain the pictures of the frame.
-            frame: Frame to draw.
-            index: Number of the panel, counted from the rear.
+            textures: Textures that contain the frame's pictures.
+            frame: The frame to draw.
+            index: Panel number, counted from the rear.
         """
         matrix = frame.solved_from_shown[index] if frame.solved_from_shown else np.eye(3)
         (width, height), (solved_width, solved_height) = textures.size_px, textures.solved_px
@@ -351,7 +353,7 @@ class Painter:
 def _compiled(
     context: moderngl.Context, names: Sequence[str], fixed: Mapping[str, Any]
 ) -> tuple[moderngl.Program, moderngl.VertexArray]:
-    """Compile the shader with the macros `names` defined, and set the uniforms `fixed`."""
+    """Compile the shader with all macros in `names` defined, and set the uniforms in `fixed`."""
     head = "#version 330 core\n" + "".join(f"#define {name}\n" for name in names)
     program = context.program(vertex_shader=VERTEX, fragment_shader=head + FRAGMENT)
     _set(program, fixed)
@@ -359,7 +361,7 @@ def _compiled(
 
 
 def _set(program: moderngl.Program, values: Mapping[str, Any]) -> None:
-    """Set uniforms, except for uniforms that the compiler has removed."""
+    """Set uniforms, skipping any that the compiler has removed."""
     for name, value in values.items():
         uniform: Any = program.get(name, None)
         if uniform is not None:

@@ -1,4 +1,4 @@
-"""Open the configured output to the panels, or an offscreen output for replay and tests."""
+"""Open the configured output to the panels, or an offscreen output for replays and tests."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class OffscreenPanels(PanelSink):
-    """Output without a screen, which accepts frames but does not draw them."""
+    """Output with no screen, which accepts frames but does not draw them."""
 
     name = "offscreen"
 
@@ -27,11 +27,11 @@ class OffscreenPanels(PanelSink):
         return PresentReport(frame.number, self._clock.now_ns(), 0.0)
 
     def close(self) -> None:
-        """Do nothing, because the output opens no windows or contexts."""
+        """Do nothing, because no windows or contexts are open."""
 
 
 class BrowserPanels(PanelSink):
-    """Output to a web page, which aligns and draws the newest frame at its own rate."""
+    """Output to a web page, which aligns and draws the latest frame at its own rate."""
 
     name = "browser"
 
@@ -47,22 +47,22 @@ class BrowserPanels(PanelSink):
 
 
 def panel_settings(settings: OutputSettings, count: int) -> tuple[PanelSettings, ...]:
-    """Return the settings of each panel, or default settings for `count` panels if none are configured."""
+    """Return each panel's settings, or default settings for `count` panels if none are configured."""
     return settings.panels or tuple(PanelSettings() for _ in range(count))
 
 
 def open_panels(settings: OutputSettings, stack: PanelStack, clock: Clock, context: moderngl.Context) -> PanelSink:
-    """Open the output that the section `[output]` of the settings describes.
+    """Open the output described by the `[output]` section of the settings.
 
     Args:
-        settings: Section `[output]` of the settings.
-        stack: Panels of the display.
-        clock: Clock of the run.
-        context: GL context of the content. The output makes the context current again at the end of each call.
+        settings: The `[output]` section of the settings.
+        stack: The display's panels.
+        clock: The run's clock.
+        context: The content's GL context. The output makes it current again at the end of each call.
 
     Raises:
-        InputError: The settings are unsuitable, for example because a panel names no monitor.
-        PanelLost: A monitor is missing or cannot be used. The failure may be temporary.
+        InputError: The settings cannot be used, for example because no monitor is named for a panel.
+        PanelLost: A monitor is missing or cannot be used. This may be temporary.
     """
     if settings.kind != "offscreen":
         from runtime.panels.window import WindowPanels

@@ -1,8 +1,8 @@
-"""Check that windows and monitors have not changed since the start, with one X query at a time.
+"""Check that windows and monitors have not changed since startup, using one X query at a time.
 
-GLFW reports connected or disconnected monitors and closed or resized windows. It does not report that another program
-has destroyed, unmapped or moved a window, or that the position or mode of a monitor has changed. After such a change, a
-picture is on the wrong panel or on no panel, although every buffer swap succeeds.
+GLFW reports when a monitor is connected or disconnected and when a window is closed or resized. It does not report when
+another program destroys, unmaps or moves a window, or when a monitor's position or mode changes. After such a change, a
+picture appears on the wrong panel or on none, even though every buffer swap succeeds.
 """
 
 from __future__ import annotations
@@ -15,29 +15,29 @@ from runtime.panels import xlib
 from runtime.panels.display import Display, Window
 from runtime.panels.monitors import Monitor
 
-EVERY_NS = NS_PER_S  # period in which each window and monitor is queried once
-REFRESH_TOLERANCE = 1e-3  # relative tolerance of refresh rates
+EVERY_NS = NS_PER_S  # each window and monitor is queried once in this period
+REFRESH_TOLERANCE = 1e-3  # relative tolerance when comparing refresh rates
 
 
 class PlacementWatch:
-    """Detects changes of the windows and monitors.
+    """Detects when a window or monitor changes.
 
-    Calls of `look` check one window or monitor at a time, and each window and monitor once in `EVERY_NS`. If the X
-    server has refused a request since the last call, a window or monitor has disappeared, so all windows and monitors
-    are checked in the same call.
+    Each call to `look` checks at most one window or monitor, so that each of them is checked once every `EVERY_NS`. But
+    if the X server has refused a request since the last call, a window or monitor has disappeared, and all of them are
+    checked in the same call.
     """
 
     def __init__(self, display: Display, monitors: Sequence[Monitor], windows: Sequence[Window], clock: Clock) -> None:
-        """Begin to watch. The first query is made after `EVERY_NS`.
+        """Start watching. The first query is made after `EVERY_NS`.
 
         Args:
             display: Connection to the X server.
-            monitors: Monitor of each panel, as assigned at the start.
-            windows: Window of each panel.
-            clock: Clock of the run.
+            monitors: Each panel's monitor, as assigned at startup.
+            windows: Each panel's window.
+            clock: The run's clock.
         """
         self._display, self._clock = display, clock
-        # Only the EDIDs of these states are used. Positions and modes are compared with those in `monitors`.
+        # Only the EDID is used from each of these. Positions and modes are compared with those in `monitors`.
         self._states = [display.output_state(monitor.connector) for monitor in monitors]
         self._monitors, self._windows = monitors, windows
         self._questions: list[Callable[[], str]] = [
@@ -49,14 +49,14 @@ class PlacementWatch:
         self._refusals = xlib.refusals()
 
     def look(self) -> str:
-        """Check a window or monitor if a check is due.
+        """Check a window or monitor if one is due.
 
         Returns:
-            The faults that were found, with the number of the panel, or an empty string.
+            Any faults found, each with the panel number, or an empty string.
         """
         if xlib.refusals() != self._refusals:
             faults = [fault for fault in (question() for question in self._questions) if fault]
-            self._refusals = xlib.refusals()  # read after the queries, because the server may refuse them too
+            self._refusals = xlib.refusals()  # read after the queries, because they may be refused too
             return "; ".join(faults)
         now_ns = self._clock.now_ns()
         if now_ns < self._due_ns:

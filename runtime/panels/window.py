@@ -1,4 +1,4 @@
-"""Show the panels in fullscreen windows on monitors, or a test card on every monitor."""
+"""Show each panel's picture in a fullscreen window on its monitor, or a test card on every monitor."""
 
 from __future__ import annotations
 
@@ -28,22 +28,22 @@ LOOK_NS = 5 * NS_PER_S  # interval between searches for monitors if X sends no n
 
 
 class WindowPanels(PanelSink):
-    """Output to X11 monitors, with one fullscreen window per panel.
+    """Output to X11 monitors, using one fullscreen window for each panel.
 
-    `present` uploads a new solution once, to textures that all windows share. It draws all windows, waits for the GPU
-    and then swaps the buffers of all windows in immediate succession. A fault before the first swap leaves the old
-    frame on all panels. Only the first window waits for its vertical blank, because N waiting windows would divide the
-    refresh rate by N. `skew_ms` is the time between the first and the last return from a swap. It does not include the
-    phase between the vertical blanks of the monitors.
+    `present` uploads a new solution once, to textures shared by all windows. It draws all windows, waits for the GPU,
+    and then swaps all windows' buffers one right after another. If anything fails before the first swap, the old frame
+    stays on all panels. Only the first window waits for its vertical blank, because with N windows waiting, the refresh
+    rate would be divided by N. `skew_ms` is the time from when the first swap returns until the last one returns. It
+    does not include phase differences between the monitors' vertical blanks.
 
-    Every window and monitor is compared with its initial state once per second. A refresh makes at most one query,
+    Once per second, each window and monitor is compared with its initial state. A refresh makes at most one query,
     which takes about 0.1 ms. If a monitor, window or context has changed or is lost, all windows are closed and
-    `present` raises PanelLost. A later call of `present` reopens the windows after half a second, or when X reports a
-    change of monitors. The hidden window keeps the shared context unless this context is also lost. If the X server
+    `present` raises PanelLost. Later calls to `present` reopen the windows after half a second, or as soon as X reports
+    that monitors have changed. The hidden window keeps the shared context, unless that is lost too. If the X server
     dies, the process ends with exit status 75 and must be restarted.
 
-    All methods must be called on the main thread, as GLFW requires. After every call, the context `content` is current
-    again.
+    All methods must be called on the main thread, because GLFW requires it. After each call, the `content` context is
+    current again.
     """
 
     name = "windows"
@@ -55,15 +55,16 @@ class WindowPanels(PanelSink):
         """Open a window for each panel.
 
         Args:
-            panels: Settings of the panels, rear to front.
-            stack: Panels of the display.
-            clock: Clock of the run.
-            content: GL context of the content.
-            any_shape: Accept and fill monitors whose resolution differs from that of the stack, for `identify`.
+            panels: Panel settings, rear to front.
+            stack: The display's panels.
+            clock: The run's clock.
+            content: The content's GL context.
+            any_shape: True to accept monitors whose resolution differs from the stack's and to fill them, for
+                `identify`.
 
         Raises:
-            InputError: A panel names no monitor, or its settings are invalid.
-            PanelLost: The X server or a monitor is missing or cannot be used. The failure may be temporary.
+            InputError: No monitor is named for a panel, or its settings are invalid.
+            PanelLost: The X server or a monitor is missing or cannot be used. This may be temporary.
             MissingPart: GLFW does not use X11.
         """
         self._any_shape = any_shape
@@ -74,7 +75,7 @@ class WindowPanels(PanelSink):
         self._textures: FrameTextures | None = None
         self._watch: PlacementWatch | None = None
         self._retry_ns, self._lost = 0, ""
-        self._shown = False  # True while the windows show the previous frame
+        self._shown = False  # True while the previous frame is on the windows
         self._away = False  # True if a context other than `content` may be current
         self._context_lost = False
         self.monitors: tuple[Monitor, ...] = ()
@@ -88,9 +89,9 @@ class WindowPanels(PanelSink):
 
     @property
     def period_ns(self) -> int | None:
-        """Refresh period of the first panel's monitor, or None if the period is unknown.
+        """Refresh period of the first panel's monitor, or None if unknown.
 
-        The vertical blanks of this monitor pace the swaps.
+        The swaps are paced by this monitor's vertical blanks.
         """
         refresh_hz = self.monitors[0].refresh_hz if self.monitors else 0.0
         return round(NS_PER_S / refresh_hz) if refresh_hz else None
@@ -100,7 +101,7 @@ class WindowPanels(PanelSink):
         return [window.handle for window, _ in self._surfaces]
 
     def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
-        """Show a frame on all panels, unless the frame is unchanged and still shown.
+        """Show a frame on all panels, unless it is unchanged and still on them.
 
         Raises:
             PanelLost: A window, monitor or context has changed or is lost.
@@ -121,7 +122,7 @@ class WindowPanels(PanelSink):
             self._give_back()
 
     def close(self) -> None:
-        """Close all windows and their contexts. The method may be called twice."""
+        """Close all windows and their contexts. May be called more than once."""
         self._drop()
         self._give_back()
 
@@ -136,7 +137,7 @@ class WindowPanels(PanelSink):
         if any(textures.lacks(frame)):
             display.root.make_current()
             textures.upload(frame)
-            # Other contexts may use the textures only after the upload has finished.
+            # The other contexts may not use the textures until the upload has finished.
             display.root.context.finish()
         for panel, (window, painter) in enumerate(self._surfaces):
             self._draw(panel, window, painter, textures, frame)
@@ -163,7 +164,7 @@ class WindowPanels(PanelSink):
         return self._clock.now_ns()
 
     def _may_try(self) -> bool:
-        """Return True if it is time to reopen the panels, after a delay or a change of connected monitors."""
+        """Return True if the delay before reopening is over or the connected monitors have changed."""
         display = self._display
         if display is not None and display.poll():
             display.faults.clear()
@@ -227,7 +228,7 @@ class WindowPanels(PanelSink):
                 log.exception("closing the display")
 
     def _forget(self) -> None:
-        """Clear the state of the closed windows, and schedule their reopening."""
+        """Clear all state kept for the closed windows, and schedule reopening them."""
         self._surfaces, self._textures, self._watch, self._shown = [], None, None, False
         self._retry_ns = self._clock.now_ns() + RETRY_NS
 
@@ -244,26 +245,26 @@ def _error(context: moderngl.Context) -> str:
 
 
 def _reset_status() -> str:
-    """Return the status that the driver reports after a GPU reset, or "" if the GPU was not reset."""
+    """Return the driver's status after a GPU reset, or "" if the GPU has not been reset."""
     address = gl_function("glGetGraphicsResetStatus")
     status: int = ctypes.CFUNCTYPE(ctypes.c_uint)(address)() if address else 0
     return f"was reset (0x{status:x})" if status else ""
 
 
 def every_monitor() -> tuple[WindowPanels, list[U8], tuple[Monitor, ...]]:
-    """Open a window on every monitor, and draw a test card for each window.
+    """Open a window on every monitor, and draw a test card for each.
 
     Returns:
         The open windows, their test cards and their monitors.
 
     Raises:
-        PanelLost: There is no X server or active monitor, or a window cannot be opened.
-        MissingPart: GLFW does not use X11, or EGL offers no OpenGL 3.3.
+        PanelLost: There is no X server or no active monitor, or a window cannot be opened.
+        MissingPart: GLFW does not use X11, or EGL does not offer OpenGL 3.3.
     """
     monitors = connected_monitors()
     width, height = max(m.width_px for m in monitors), max(m.height_px for m in monitors)
     bound = tuple(PanelSettings(connector=monitor.connector) for monitor in monitors)
-    # The geometry does not matter, because the cards fill monitors of any shape.
+    # The dimensions do not matter, because each card fills its monitor, of any shape.
     stack = PanelStack(1.0, 1.0, tuple(0.01 * index for index in range(len(monitors))), width, height)
     panels = WindowPanels(bound, stack, MonotonicClock(), offscreen_context(), any_shape=True)
     cards = []

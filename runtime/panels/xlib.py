@@ -1,7 +1,7 @@
-"""Query the state of outputs and handle X errors, with Xlib and RandR functions that GLFW lacks.
+"""Query the state of outputs and handle X errors, using Xlib and RandR functions not offered by GLFW.
 
-The functions are called through ctypes from libraries that GLFW loads anyway. By default, Xlib ends the process after
-any error.
+The functions are called through ctypes, in libraries that GLFW loads anyway. Without the error handlers, Xlib would end
+the process after any error.
 """
 
 from __future__ import annotations
@@ -77,10 +77,10 @@ class _Crtc(ctypes.Structure):
 
 @dataclass(frozen=True, slots=True)
 class OutputState:
-    """Mode and monitor of one output of the graphics card."""
+    """The mode and monitor of one of the graphics card's outputs."""
 
-    place: Rectangle  # region of the X screen that the output shows
-    refresh_hz: float  # 0 if the refresh rate is unknown
+    place: Rectangle  # the region of the X screen shown by this output
+    refresh_hz: float  # 0 if unknown
     edid: bytes  # empty if the monitor has no EDID
 
 
@@ -112,9 +112,9 @@ _refused = 0  # number of refused requests
 
 
 def refusals() -> int:
-    """Return the number of requests that the X server has refused.
+    """Return how many requests the X server has refused.
 
-    An increase means that a window or monitor has disappeared.
+    If this number grows, a window or monitor has disappeared.
     """
     return _refused
 
@@ -133,7 +133,7 @@ def _end(_display: int = 0) -> int:
     os._exit(SERVER_DIED)
 
 
-# Xlib keeps the addresses of these handlers until the process ends, so they must not be garbage-collected.
+# Xlib holds pointers to these handlers until the process ends, so they must not be garbage-collected.
 _ERROR_HANDLER = ErrorHandler(_note_error)
 _IO_ERROR_HANDLER = IOErrorHandler(_end)
 
@@ -141,9 +141,9 @@ _IO_ERROR_HANDLER = IOErrorHandler(_end)
 def take_over_errors() -> None:
     """Install handlers for X errors.
 
-    A refused X request, for example for an unplugged monitor, is only logged and counted. If the X server dies, the
-    process logs a message and ends immediately, because Xlib, EGL and GLFW would hang or crash even while releasing
-    objects.
+    If the X server refuses a request, for example because a monitor has been unplugged, this is only logged and
+    counted. If the X server dies, the process logs a message and ends immediately, because Xlib, EGL and GLFW would
+    hang or crash even when asked to release objects.
     """
     x11 = _libraries()[0]
     x11.XSetErrorHandler(_ERROR_HANDLER)
@@ -151,17 +151,17 @@ def take_over_errors() -> None:
 
 
 class ServerWatch:
-    """Ends the process if the X server dies while the main thread hangs in a call.
+    """Ends the process if the X server dies while the main thread is stuck in a call.
 
-    Without the watch, a broken connection would make Mesa's software renderer loop endlessly in a buffer swap, and Xlib
+    Without this, if the connection broke during a buffer swap, Mesa's software renderer would loop endlessly, and Xlib
     would not notice.
     """
 
     def __init__(self, display: int) -> None:
-        """Start to watch a connection on a new thread.
+        """Start watching a connection on a new thread.
 
         Args:
-            display: Pointer to an open Xlib `Display`. Call `stop` before closing the display.
+            display: Pointer to an open Xlib `Display`. Call `stop` before closing it.
         """
         x11 = _libraries()[0]
         x11.XConnectionNumber.argtypes = [c_void_p]
@@ -171,7 +171,7 @@ class ServerWatch:
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop watching. Call this method before deliberately closing the connection."""
+        """Stop watching. Call this before closing the connection on purpose."""
         os.write(self._stop_writing, b".")
         self._thread.join()
         os.close(self._stop_reading)
@@ -179,7 +179,7 @@ class ServerWatch:
 
     def _watch(self) -> None:
         poll = select.poll()
-        poll.register(self._connection, 0)  # report only hang-ups and errors, not input
+        poll.register(self._connection, 0)  # hang-ups and errors are reported, but not input
         poll.register(self._stop_reading, select.POLLIN)
         for file, _ in poll.poll():
             if file == self._connection:
@@ -187,13 +187,13 @@ class ServerWatch:
 
 
 def output_state(display: int, output: int) -> OutputState | None:
-    """Return the state of an output, or None if the output is off or disconnected.
+    """Return an output's state, or None if the output is off or disconnected.
 
-    The query takes four round trips to the X server.
+    This takes four round trips to the X server.
 
     Args:
         display: Pointer to an Xlib `Display`.
-        output: RandR identifier of the output.
+        output: The output's RandR identifier.
     """
     x11, randr = _libraries()
     resources = randr.XRRGetScreenResourcesCurrent(display, x11.XDefaultRootWindow(display))

@@ -1,9 +1,9 @@
-// Optics of a stack of panels, rendering in WebGL 2, and plans of eyes and panels.
-// Points are in frame `stack`, in metres: x out of the screen, y to the viewer's right, z up. Matrices are 3x3 and
+// Optics of a panel stack, rendering with WebGL 2, and plans of eyes and panels.
+// Points are in the `stack` frame, in metres: x out of the screen, y to the viewer's right, z up. Matrices are 3x3 and
 // stored in row-major order.
 
-const NEAREST_M = 0.01, MOST_SHIFT = 0.5, MOST_SCALE = 2; // limits of an alignment, equal to those in runtime.optics
-const PUPILS = 7; // number of points of a pupil that are traced
+const NEAREST_M = 0.01, MOST_SHIFT = 0.5, MOST_SCALE = 2; // alignment limits, the same as in runtime.optics
+const PUPILS = 7; // number of points traced in each pupil
 
 export const mul = (a, b) => [0, 1, 2].flatMap((i) => [0, 1, 2].map((j) => a[3 * i] * b[j] + a[3 * i + 1] * b[3 + j] + a[3 * i + 2] * b[6 + j]));
 export const apply = (m, x, y) => {
@@ -20,8 +20,8 @@ function reference(stack) {
   return stack.x_m.length % 2 ? stack.x_m[half] : (stack.x_m[half - 1] + stack.x_m[half]) / 2;
 }
 
-// Return the homography from a pixel (u right, v down, 1) of an eye's picture to (y, z, 1) on the plane x = x_m. The
-// eye looks at the origin.
+// Return the homography that maps a pixel (u right, v down, 1) of an eye's picture to (y, z, 1) on the plane x = x_m.
+// The eye looks at the origin.
 export function planeFromPicture(eye, picture, x_m) {
   const norm = Math.hypot(...eye), back = eye.map((v) => v / norm), across = Math.hypot(eye[0], eye[1]) || 1;
   const right = [-eye[1] / across, eye[0] / across, 0];
@@ -34,8 +34,8 @@ export function planeFromPicture(eye, picture, x_m) {
     ...ray[0].map((v) => -v)];
 }
 
-// Return half the width and half the height, at focal length 1, of the picture that contains everything that the eyes
-// see through all panels.
+// Return half the width and half the height of a picture just large enough for everything that the eyes see through all
+// panels, at focal length 1.
 export function reach(stack, eyes) {
   const { width_m, height_m, x_m } = stack;
   const found = eyes.map((eye) => {
@@ -46,14 +46,14 @@ export function reach(stack, eyes) {
       const ray = [x, (a * width_m) / 2, (b * height_m) / 2].map((v, k) => v - eye[k]), depth = Math.max(1e-6, -dot(ray, back));
       return [dot(ray, right) / depth, dot(ray, up) / depth];
     })));
-    return [0, 1].map((k) => Math.max(...[-1, 1].map((side) => // the narrowest panel limits the picture
+    return [0, 1].map((k) => Math.max(...[-1, 1].map((side) => // the picture is limited by the narrowest panel
       Math.min(...panels.map((corners) => Math.max(...corners.map((corner) => side * corner[k])))))));
   });
   return [0, 1].map((k) => Math.max(1e-3, ...found.map((one) => one[k])));
 }
 
-// Return the homography from a point (y, z, 1) of the ideal panel to the point of the tilted panel's layer that an eye
-// sees in the same direction, or null if the panel is not tilted.
+// Return the homography that maps a point (y, z, 1) on the ideal panel to the point on the tilted panel's layer that an
+// eye sees in the same direction, or null if the panel is not tilted.
 function layerFromSeen(stack, n, eye) {
   const depth = stack.tilt?.depth[n];
   if (!depth?.some((v) => v)) return null;
@@ -69,14 +69,14 @@ function layerFromSeen(stack, n, eye) {
   return [0, 1, 2].flatMap((i) => columns.map((column) => column[i]));
 }
 
-// Return the affine map from (y, z, 1) to panel pixels.
+// Return the affine transform from (y, z, 1) to panel pixels.
 function pixels(stack) {
   const u = stack.width_px / stack.width_m, v = stack.height_px / stack.height_m;
   return [u, 0, stack.width_px / 2, 0, -v, stack.height_px / 2, 0, 0, 1];
 }
 
-// Return the homography from the pixels of a picture to the pixels of panel n. The ray of a pixel runs from `eye`
-// through the point of the centre panel that the eye `nominal` sees at the pixel.
+// Return the homography that maps picture pixels to pixels on panel n. Each pixel's ray runs from `eye` through the
+// point on the centre panel that the `nominal` eye sees at that pixel.
 export function panelFromPicture(stack, n, eye, picture, nominal = eye) {
   const x = centre(stack), share = (stack.x_m[n] - eye[0]) / (x - eye[0]);
   const carried = [share, 0, eye[1] * (1 - share), 0, share, eye[2] * (1 - share), 0, 0, 1];
@@ -85,10 +85,11 @@ export function panelFromPicture(stack, n, eye, picture, nominal = eye) {
   return mul(pixels(stack), seen ? mul(seen, ideal) : ideal);
 }
 
-// Return the alignment of solved layers to other eyes. runtime/optics/alignment.py and relief.py derive the equations.
+// Return the alignment of solved layers to other eyes. For the equations, see runtime/optics/alignment.py and
+// relief.py.
 // maps: for each panel, [scale u, scale v, shift u, shift v] from shown pixels to pixels of the solution.
-// parallax: motion of content that is not on the middle panel.
-// limited: the reason if the alignment reaches its limit before the eyes, otherwise empty.
+// parallax: how content that is not on the middle panel moves.
+// limited: why the alignment reaches its limit before the eyes, or empty if it does not.
 export function alignment(stack, solved, eyes) {
   const old = middle(solved), now = middle(eyes), step = now.map((v, k) => v - old[k]), r = reference(stack);
   let share = 1, limited = "";
@@ -118,12 +119,13 @@ export function alignment(stack, solved, eyes) {
   return { maps, limited, parallax: parallax(stack, old, old.map((v, k) => v + went[k])) };
 }
 
-// Return the map in pixels of a scale by 1 + larger about the centre of the panels and a shift right and up in metres.
+// Return the map, in pixels, that scales by 1 + larger about the panels' centre and then shifts right and up (in
+// metres).
 const mapped = (stack, larger, [right, up]) => [1 + larger, 1 + larger,
   ((-stack.width_m / 2) * larger + right) * (stack.width_px / stack.width_m), -((stack.height_m / 2) * larger + up) * (stack.height_px / stack.height_m)];
 
-// Return the motion of content when the midpoint of the eyes moves from `old` to `now`. The result is null if the
-// midpoint does not move, or if the number of panels is even and there is no middle panel.
+// Return how content moves when the eyes' midpoint moves from `old` to `now`. The result is null if the midpoint does
+// not move, or if there is no middle panel because the number of panels is even.
 function parallax(stack, old, now) {
   if (stack.x_m.length % 2 === 0 || old.every((v, k) => v === now[k])) return null;
   const r = reference(stack), k = (old[0] - r) / (now[0] - r), growth = 1 - k;
@@ -140,7 +142,7 @@ export const unaligned = (stack) => ({ maps: stack.x_m.map(() => [1, 1, 0, 0]), 
 const VERTEX = `#version 300 es
 void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0); }`;
 
-// Position of a shown pixel in the solution, in pixels of the solution, which may be coarser than the panels. If the
+// Position of a shown pixel in the solution, in solution pixels, which may be coarser than the panels' pixels. If the
 // relief is unknown, it is 0 everywhere.
 const SOLVED_AT = `precision highp float; precision highp sampler2D; precision highp sampler2DArray;
 const int PANELS = @PANELS@;
@@ -152,7 +154,7 @@ vec2 solved_at(int n, vec2 px) {
   return (px * maps[n].xy + maps[n].zw + b * (drift.xy + drift.z * middle)) * solved_px / size;
 }`;
 
-// Layer as its panel shows it: aligned, mixed with the flat picture, and rounded to 8 bits by the framebuffer.
+// A layer as shown by its panel: aligned, mixed with the flat picture, and rounded to 8 bits by the framebuffer.
 const SHOW = `#version 300 es
 ${SOLVED_AT}
 uniform sampler2DArray layers, flat_picture; uniform int panel, extended; uniform float flatness;
@@ -171,8 +173,8 @@ void main() {
   colour = vec4(code, 1.0);
 }`;
 
-// Draft picture of an eye, with one ray per pixel through the interpolated solution. The relief is read at the point
-// where the ray crosses the middle panel. A draft takes a tenth of the time of drawing and tracing the panels.
+// A draft of an eye's picture, with one ray per pixel through the interpolated solution. The relief is read at the
+// point where the ray crosses the middle panel. A draft takes a tenth of the time needed to draw and trace the panels.
 const QUICK = `#version 300 es
 ${SOLVED_AT}
 uniform sampler2DArray layers; uniform mat3 into[PANELS]; uniform vec2 origin; uniform vec3 room;
@@ -189,8 +191,8 @@ void main() {
   colour = vec4(seen ? s * s : room, 1.0);
 }`;
 
-// Picture that an eye sees, which is sin² of the summed phases along each ray. The function `light` averages over a
-// pixel. Panel pixels are uniform squares.
+// The picture seen by an eye: sin² of the sum of the phases along each ray, averaged over each pixel by the function
+// `light`. Panel pixels are uniform squares.
 const SEE = (light) => `#version 300 es
 precision highp float; precision highp sampler2DArray;
 const int PANELS = @PANELS@;
@@ -222,7 +224,7 @@ void main() {
   colour = vec4(seen, sum.a);
 }`;
 
-// Function `light` that averages a grid of `rays` by `rays` rays.
+// A `light` function that averages a grid of `rays` by `rays` rays.
 const GRID = `
 vec4 ray(vec2 p) { // alpha 1: the ray crosses every panel
   vec3 sum = vec3(0.0);
@@ -240,7 +242,7 @@ vec4 light(vec2 p) {
   return sum * share * share;
 }`;
 
-// Function `light` that is exact, because it divides each pixel at every edge of a panel pixel.
+// An exact `light` function, which divides each pixel at every panel pixel edge.
 const BOXES = `
 float next(float at, float slope) { // distance along the pixel to the next edge
   float edge = slope > 0.0 ? floor(at + 1e-4) + 1.0 : ceil(at - 1e-4) - 1.0;
@@ -280,7 +282,7 @@ vec4 light(vec2 p) {
   return sum;
 }`;
 
-// Panel drawn as a parallelogram with a corner and two edges in clip space (-1 to 1).
+// A panel drawn as a parallelogram, given a corner and two edges in clip space (-1 to 1).
 const CARD_VERTEX = `#version 300 es
 uniform vec2 corner, right, down; out vec2 at;
 void main() { at = vec2(gl_VertexID & 1, gl_VertexID >> 1); gl_Position = vec4(corner + right * at.x + down * at.y, 0.0, 1.0); }`;
@@ -295,7 +297,7 @@ void main() {
   colour = vec4(sum * 0.25, 1.0) * opacity;
 }`;
 
-// Draws a display on a canvas. Layers are stored in texture arrays with one slice per panel.
+// Draws a display on a canvas. Layers are stored in texture arrays, with one slice for each panel.
 export class Display {
   constructor(canvas, stack) {
     this.canvas = canvas;
@@ -315,7 +317,7 @@ export class Display {
     this.unfold(null);
     this.targets = [null, null];
     this.framebuffer = g.createFramebuffer();
-    this.drawn = null; // alignment and flatness with which `shown` was drawn; null if it must be drawn again
+    this.drawn = null; // alignment and flatness used to draw `shown`; null if it must be drawn again
   }
 
   #layers(width, height) {
@@ -354,8 +356,8 @@ export class Display {
     return places;
   }
 
-  // Load the layers `solved` or `flat` from concatenated RGBA bytes or from one picture per panel. The width and height
-  // are those of a panel unless the solution is coarser.
+  // Load the `solved` or `flat` layers from concatenated RGBA bytes or from one picture for each panel. Width and
+  // height are the panels' unless the solution is coarser.
   load(name, layers, [w, h] = [this.stack.width_px, this.stack.height_px]) {
     const g = this.g, key = name === "solved" ? `${w}x${h}` : name;
     g.activeTexture(g.TEXTURE0);
@@ -368,8 +370,8 @@ export class Display {
     this.drawn = null;
   }
 
-  // Set the relief of the solution on the middle panel from 16-bit floats. If the relief is null, content does not move
-  // on this panel.
+  // Set the solution's relief on the middle panel from 16-bit floats. If it is null, content does not move on this
+  // panel.
   unfold(relief, [w, h] = [1, 1]) {
     const g = this.g;
     g.deleteTexture(this.relief);
@@ -384,7 +386,7 @@ export class Display {
     this.drawn = null;
   }
 
-  // Set the uniforms of a program that determine the position of the solution on each panel.
+  // Set a program's uniforms for the solution's position on each panel.
   #align(places, { maps, parallax }) {
     const g = this.g, { width_px: w, height_px: h } = this.stack, still = { drift: [0, 0, 0], middles: maps, weights: maps.map(() => 0) };
     const { drift, middles, weights } = parallax ?? still;
@@ -392,7 +394,7 @@ export class Display {
     g.uniform4fv(places.middles, middles.flat());
     g.uniform1fv(places.weights, weights);
     g.uniform3f(places.drift, ...drift);
-    g.uniform1f(places.rest, this.stack.rest_code / 255); // value of pixels outside a shifted solution
+    g.uniform1f(places.rest, this.stack.rest_code / 255); // value used outside a shifted solution
     g.uniform2f(places.size, w, h);
     g.uniform2f(places.solved_px, ...this.solved_px);
     g.activeTexture(g.TEXTURE2);
@@ -400,7 +402,7 @@ export class Display {
     g.uniform1i(places.relief, 2);
   }
 
-  // Set the target picture of an eye, or remove it if `image` is null.
+  // Set an eye's target picture, or remove it if `image` is null.
   target(side, image) {
     const g = this.g, texture = image && g.createTexture();
     g.deleteTexture(this.targets[side]);
@@ -414,7 +416,7 @@ export class Display {
     g.texParameteri(g.TEXTURE_2D, g.TEXTURE_MIN_FILTER, g.LINEAR_MIPMAP_LINEAR);
   }
 
-  // Draw the panels with the aligned solution, mixed with the flat picture.
+  // Draw the panels, showing the aligned solution mixed with the flat picture.
   show(aligned, flatness = 0) {
     const g = this.g, key = JSON.stringify([aligned, flatness]);
     if (key === this.drawn) return;
@@ -436,12 +438,13 @@ export class Display {
     this.drawn = key;
   }
 
-  // Draw the picture of one eye into a part of the bound framebuffer.
-  // nominal: eye whose picture is treated as painted on the centre panel.
-  // part: [x, y, width, height], with y measured from the bottom.
-  // quick: alignment with which the solution is sampled directly, or null to trace the panels drawn by `show`.
+  // Draw one eye's picture into part of the bound framebuffer.
+  // nominal: eye whose picture is treated as if painted on the centre panel.
+  // part: [x, y, width, height]; y is measured from the bottom.
+  // quick: alignment used to sample the solution directly, or null to trace the panels drawn by `show`.
   // rays: number of rays per pixel in each direction, or 0 for the exact picture.
-  // gain: 0 draws the picture, 1 draws the target, and larger values draw the difference from the target times `gain`.
+  // gain: 0 draws the picture, 1 draws the target, and larger values draw the difference from the target, multiplied by
+  // `gain`.
   see({ eye, nominal = eye, picture, part, quick = null, rays = 0, pupil_mm = 0, side = 0, gain = 0, stride = [1, 1], room = [0.07, 0.08, 0.1] }) {
     const g = this.g, { stack } = this, places = quick ? this.#use("quick", "solved") : this.#use(rays ? "grid" : "boxes", "shown");
     g.viewport(...part);
@@ -474,8 +477,8 @@ export class Display {
     g.drawArrays(g.TRIANGLES, 0, 3);
   }
 
-  // Return the picture of `see` as RGBA bytes, top row first. Alpha is 255 where every ray crosses every panel. The
-  // picture is drawn in strips of 64 rows, because browsers abort long draw calls.
+  // Return the picture drawn by `see` as RGBA bytes, top row first. Alpha is 255 where every ray crosses every panel.
+  // The picture is drawn in strips of 64 rows, because browsers abort long draw calls.
   seen({ columns, rows, ...how }) {
     const g = this.g, texture = g.createTexture(), bytes = new Uint8Array(columns * rows * 4);
     g.activeTexture(g.TEXTURE1);
@@ -499,7 +502,7 @@ export class Display {
     return bytes;
   }
 
-  // Return the exact picture of an eye as a PNG in a data URL.
+  // Return an eye's exact picture as a PNG data URL.
   picture(how, width, height) {
     const bytes = this.seen({ ...how, columns: width, rows: height, picture: { width, height, fov_deg: how.fov_deg } });
     for (let k = 3; k < bytes.length; k += 4) bytes[k] = 255;
@@ -518,7 +521,7 @@ export class Display {
     return [...found.slice(0, 3)];
   }
 
-  // Draw panel n as a parallelogram, given a corner, the right edge and the downward edge in canvas pixels.
+  // Draw panel n as a parallelogram, given a corner and the edges to the right and down from it, in canvas pixels.
   card(n, corner, right, down, opacity = 1) {
     const g = this.g, places = this.#use("card", "shown"), { width, height } = this.canvas;
     g.viewport(0, 0, width, height);
@@ -533,8 +536,8 @@ export class Display {
   }
 }
 
-// Draw a plan of eyes and panels in an SVG element, from above (axis 1) or from the side (axis 2). The x axis, which
-// points towards the viewer, points right in the plan.
+// Draw a plan of eyes and panels in an SVG element, seen from above (axis 1) or from the side (axis 2). The x axis,
+// which points towards the viewer, points right in the plan.
 export function drawPlan(svg, { stack, eyes, axis, range = null, sigma_m = 0, solved = null, far_m = 1 }) {
   const size_m = axis === 1 ? stack.width_m : stack.height_m;
   const far = Math.max(far_m, eyes ? 1.15 * Math.max(eyes[0][0], eyes[1][0]) : 0);

@@ -1,5 +1,5 @@
-// User interface of a page that shows a display, with control of the head by pointer and keys, viewing modes and
-// figures.
+// User interface for a page that shows a display: the head is moved with the pointer or keys, and there are viewing
+// modes and figures.
 import { Display, alignment, unaligned, drawPlan, middle, moved, reach } from "/display.js";
 
 const MODES = [ // key, name, group, hint
@@ -15,12 +15,13 @@ const MODES = [ // key, name, group, hint
   ["difference", "Difference × 8", "Check", "What each eye sees minus what it should see; black is perfect. For the head position the layers were solved for."],
 ];
 const KEYS = { ArrowLeft: [0, -1, 0], ArrowRight: [0, 1, 0], ArrowUp: [0, 0, 1], ArrowDown: [0, 0, -1], "+": [-2, 0, 0], "-": [2, 0, 0] };
-// Without a GPU, drawing takes processor time from the solver, so fewer and smaller pictures are drawn while the head
-// moves.
+// Without a GPU, drawing takes processor time away from the solver, so while the head moves, pictures are drawn less
+// often and smaller.
 const SOFTWARE = { rays: 1, coarse: 0.5, frame_ms: 60 };
-// STEP_M: movement of the head per key press. REACH_M: movement for a pointer movement across the whole picture.
+// STEP_M: how far each key press moves the head. REACH_M: how far the head moves when the pointer crosses the whole
+// picture.
 const STEP_M = 0.005, REACH_M = [0.5, 0.3];
-// SAMPLED: light is measured at every SAMPLED-th pixel in each direction.
+// SAMPLED: light is measured at every SAMPLED-th pixel in both directions.
 const REST_MS = 200, REST_RAYS = 5, STRIPS = 12, WIGGLE_MS = 280, REPORT_MS = 120, SAMPLED = 12;
 const PAGE = `
 <div class="stage"><canvas tabindex="0" aria-label="What the eyes see. Arrow keys move the head, + and - bring it nearer and farther."></canvas>
@@ -37,9 +38,9 @@ const node = (name, text = "", kind = "") => Object.assign(document.createElemen
 const mm = (metres) => Math.round(Math.abs(metres) * 1000);
 
 export class Look {
-  // scene: `stack`, `fov_deg`, and `eyes_m`, for which the layers were solved.
-  // eyesAt: function that returns the two eyes for a displacement of the head.
-  // onTheWay: function that returns the present displacement of a head that is moving to a given displacement.
+  // scene: `stack`, `fov_deg`, and `eyes_m`, the eyes that the layers were solved for.
+  // eyesAt: function that returns both eyes, given how far the head is displaced.
+  // onTheWay: function that returns how far the head is displaced now while it moves to a given displacement.
   constructor(root, scene, { title, eyesAt = (head) => moved(scene.eyes_m, head), onTheWay = (head) => head }) {
     root.innerHTML = PAGE;
     this.$ = (query) => root.querySelector(query);
@@ -49,11 +50,11 @@ export class Look {
     Object.assign(this, { mode: "parallel", head: [0, 0, 0], aligned: true, pupil: false, point: [0, 0], rays: 3, coarse: 1, frame_ms: 0, painted_ms: 0, reported_ms: 0, frames: 0 });
     if (this.display.software) Object.assign(this, SOFTWARE);
     this.flatness = 0;
-    this.used = null; // eyes that the panels are aligned to; null if these are the true eyes
-    this.state = ""; // reason why the picture differs from the picture that the two eyes should see
-    this.onhead = () => {}; // called after the head has been moved
+    this.used = null; // eyes that the panels are aligned to; null: the true eyes
+    this.state = ""; // why the picture differs from what the two eyes should see
+    this.onhead = () => {}; // called after the head has moved
     this.onframe = () => {}; // called after a picture has been drawn
-    this.onmode = () => {}; // called when a mode is chosen, with true if the mode needs target pictures
+    this.onmode = () => {}; // called when a mode is chosen, with true if it needs target pictures
     this.$("h1").textContent = title;
     this.$(".stage").style.setProperty("--aspect", this.stack.width_m / this.stack.height_m);
     this.#modes();
@@ -71,7 +72,7 @@ export class Look {
     return alignment(this.stack, this.scene.eyes_m, this.used ?? this.eyes);
   }
 
-  // Change the positions of the panels. Layers for the new positions are loaded later.
+  // Change the panels' positions. Layers for the new positions are loaded later.
   turnTo(stack) {
     this.stack = this.scene.stack = this.display.stack = stack;
     this.scene.eyes_m = null;
@@ -83,14 +84,14 @@ export class Look {
     this.draw();
   }
 
-  // Show a message over the picture, or hide the message if `text` is empty.
+  // Show a message over the picture. If `text` is empty, hide it.
   notice(text) {
     const box = this.$(".notice");
     if (box.textContent !== text) box.textContent = text;
     box.hidden = !text;
   }
 
-  // Redraw at the next frame, and again with more rays if nothing changes for REST_MS.
+  // Redraw at the next frame, and then again with more rays if nothing changes for REST_MS.
   draw() {
     this.moving = performance.now();
     this.fresh = true;
@@ -156,7 +157,8 @@ export class Look {
     return { width, height, resized };
   }
 
-  // Return a picture whose field of view contains everything that the eyes solved for can see through all panels.
+  // Return a picture with a field of view wide enough for everything that the eyes solved for can see through all
+  // panels.
   #picture(width, height) {
     const [across, up] = reach(this.stack, this.scene.eyes_m ?? this.eyes);
     const focal = 0.48 * Math.min(width / across, height / up);
@@ -195,7 +197,7 @@ export class Look {
     this.#names(mode === "anaglyph" ? [] : sides.map((side, k) => [`${side ? "right" : "left"} eye`, ((k % across) + 0.5) / across, (Math.floor(k / across) + 1) / down]));
   }
 
-  // Return true if two target pictures can be drawn larger side by side than one above the other.
+  // Return true if two target pictures can be drawn larger next to each other than one above the other.
   #fitsSideBySide(width, height) {
     const { width: pw, height: ph } = this.scene.picture;
     return Math.min(width / 2 / pw, height / ph) >= Math.min(width / pw, height / 2 / ph);
@@ -225,7 +227,7 @@ export class Look {
     this.#names(names);
   }
 
-  // Return the projection for an exploded view of the panels from the upper left, in which two rays cross at a point of
+  // Return the projection for an exploded view of the panels from the upper left, where two rays cross at a point on
   // the centre panel.
   #drawnApart(width, height) {
     const { x_m, width_m, height_m } = this.stack, deep = x_m.at(-1) - x_m[0], scale = Math.min((0.56 * width) / width_m, (0.6 * height) / height_m);
@@ -264,7 +266,7 @@ export class Look {
     this.#names(x_m.map((x, n) => [panelName(n, count), ...at(x, -0.36 * width_m, height_m / 2).map((p, k) => p / (k ? height : width))]));
   }
 
-  // Return a line of text with the panel values along a ray and the resulting light.
+  // Return a line of text that gives the panel values along a ray and the resulting light.
   #sum(kind, codes) {
     const line = node("p", `${kind} eye: `, kind);
     if (codes.includes(null)) return line.append("misses a panel"), line;
@@ -293,8 +295,8 @@ export class Look {
     this.$(".head").textContent = `${where}${limit}.`;
   }
 
-  // Measure and show the PSNR of the light at the two eyes on sampled pixels. Target pictures are treated as painted on
-  // the centre panel.
+  // Measure the PSNR of the light at both eyes on sampled pixels, and show it. The target pictures are treated as if
+  // painted on the centre panel.
   #measure() {
     const { display, scene } = this;
     this.isMeasured = true;
@@ -313,7 +315,7 @@ export class Look {
       }
     }
     if (!counted) return void (this.$(".light").textContent = "No ray from here crosses all panels.");
-    // The error of compressed target pictures is subtracted.
+    // Subtract the error due to compressing the target pictures.
     this.light_db = -10 * Math.log10(Math.max(error / counted - (scene.target_error ?? 0), 1e-9));
     const words = this.light_db > 33 ? "hard to distinguish from the target" : this.light_db > 27 ? "a good picture with faint traces of the other layers" :
       this.light_db > 21 ? "obvious ghosts and coloured edges" : "the layers fall apart";
@@ -393,7 +395,7 @@ export class Look {
     this.moveTo([Math.max(least, Math.min(1.5, this.head[0] + metres)), this.head[1], this.head[2]]);
   }
 
-  // Functions that every page provides to scripts (docs/contracts.md).
+  // Functions that every page makes available to scripts (docs/contracts.md).
   get doors() {
     return {
       setHead: (head) => this.moveTo([...head]),

@@ -1,4 +1,4 @@
-// Script of a self-contained page that shows one solution from embedded layers and target pictures.
+// Script for a self-contained page that shows one solution, using embedded layers and target pictures.
 import { Look } from "/look.js";
 
 const read = (id) => JSON.parse(document.getElementById(id).textContent);

@@ -1,12 +1,12 @@
-// Script of the live display, which shows the panels. The pointer acts as the head that the daemon's sensor sees.
+// Script for the live display, which shows the panels. The pointer acts as the head seen by the daemon's sensor.
 import { Look } from "/look.js";
 import { ask, token } from "/session.js";
 
-// AGAIN_MS: interval at which the position of a resting head is sent again.
-// KEPT: number of latencies in the statistics.
+// AGAIN_MS: how often a resting head's position is sent again.
+// KEPT: number of latencies used for statistics.
 const AGAIN_MS = 500, STATUS_MS = 500, RETRY_MS = 1000, KEPT = 600;
 const PLACE_M = [0.6, 0, 0];
-// Peak acceleration of a quick head, duration of its shortest movement, and time between samples.
+// A quick head's peak acceleration, the duration of its shortest movement, and the time between samples.
 const PEAK_M_S2 = 12, LEAST_S = 0.1, STEP_MS = 12;
 const CONTROLS = `
 <dl class="figures"></dl>
@@ -26,28 +26,28 @@ const CONTROLS = `
 
 let look = null, socket = null, viewer = false, sensor = true, lastSent = 0, follows = null, ipd_m = 0.063, newest = null, pending = null;
 let checks = false, camera = null, lookedAt = null;
-// wishes: number of commands in progress. answered_ms: time at which the last command ended.
+// wishes: number of commands in progress. answered_ms: when the last command ended.
 let layersSeen = { solved: false, flat: false }, first = null, wishes = 0, answered_ms = 0;
 const latencies = [], drawn = [];
 const main = document.querySelector("main");
 
-// Positions of the two eyes of a head that faces the centre of the display.
+// Positions of both eyes of a head that faces the display's centre.
 function eyesOf(head) {
   const at = PLACE_M.map((v, k) => v + head[k]), norm = Math.hypot(at[0], at[1]);
   const right = [-at[1] / norm, at[0] / norm, 0];
   return [-0.5, 0.5].map((side) => at.map((v, k) => v + side * ipd_m * right[k]));
 }
 
-// True eyes if this page's pointer is the head. Otherwise, the newest eyes that the daemon measured for another page or
-// a camera.
+// The true eyes if this page's pointer is the head. If not, the eyes last measured by the daemon for another page or a
+// camera.
 const eyesNow = (head) => (viewer && sensor ? eyesOf(head) : newest?.eyes_m ?? follows ?? eyesOf([0, 0, 0]));
 const say = (message) => { if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message)); };
 
-// The head follows the pointer along a minimum-jerk path, which is replanned when the pointer moves. Without this path,
-// the tracker would mistake a jump of the pointer for another person.
+// The head follows the pointer along a minimum-jerk path, which is replanned whenever the pointer moves. Otherwise, if
+// the pointer jumped, the tracker would think that it saw another person.
 let way = { begin_ms: 0, seconds: 0, curves: [0, 1, 2].map(() => [0, 0, 0, 0, 0, 0]) }, step = null;
 
-// Position, velocity and acceleration of the head along each axis.
+// The head's position, velocity and acceleration along each axis.
 function motion(ms) {
   const t = Math.min((ms - way.begin_ms) / 1000, way.seconds);
   return way.curves.map(([a, b, c, d, e, f]) => [a + t * (b + t * (c + t * (d + t * (e + t * f)))),
@@ -57,7 +57,7 @@ const head = () => motion(performance.now()).map(([place]) => place);
 
 function follow() {
   const now = performance.now(), moving = motion(now), away = Math.hypot(...moving.map(([place], k) => look.head[k] - place));
-  // The peak acceleration of a minimum-jerk movement is 5.77 times away / T².
+  // A minimum-jerk movement has a peak acceleration of 5.77 times away / T².
   const T = Math.max(LEAST_S, Math.sqrt((5.77 * away) / PEAK_M_S2));
   way = { begin_ms: now, seconds: T, curves: moving.map(([p, v, a], k) => {
     const rest = look.head[k] - p - v * T - (a * T * T) / 2, speed = -v - a * T;
@@ -123,8 +123,8 @@ function build({ stack, fov_deg }) {
   about();
 }
 
-// Target pictures exist only for measured refreshes. The modes that need target pictures show the newest measured
-// refresh instead of the live picture.
+// Target pictures exist only for measured refreshes. A mode that needs them shows the latest measured refresh instead
+// of the live picture.
 function check(on) {
   if (on === checks) return;
   checks = on;
@@ -134,8 +134,8 @@ function check(on) {
   say({ checks });
 }
 
-// Send the pictures of this browser's camera if the user permits the camera. Each picture is sent after the daemon has
-// answered the previous picture, or after 250 ms.
+// Send pictures from this browser's camera if the user allows it. Each picture is sent once the daemon has answered the
+// previous one, or after 250 ms.
 async function film(on) {
   camera?.getTracks().forEach((track) => track.stop());
   camera = null;
@@ -205,7 +205,7 @@ function take({ refresh, viewer: mine }) {
   if (layersSeen.solved && flatness < 1) first?.();
 }
 
-// Message that explains why the picture differs from the picture that the two eyes should see.
+// A message that explains why the picture differs from what the two eyes should see.
 function explained({ state, reason }) {
   const late = /solutions take (\d+) ms|has not answered for (\d+) ms/.exec(reason);
   if (!late) return `${state.split(":")[0]}: ${reason}`;
@@ -275,12 +275,12 @@ async function about() {
   }
 }
 
-// Show the figures of a status. asked_ms: time at which the status was requested. The controls are updated only if the
-// status was requested after the last command had ended.
+// Show the figures in a status. asked_ms: when the status was requested. The controls are updated only if this was
+// after the last command had ended.
 function figures(now, asked_ms) {
   const at = (share) => [...latencies].sort((a, b) => a - b)[Math.floor(share * (latencies.length - 1))];
   const rests = now.eyes_label === "rested", solves = now.solutions_per_s_now > 0;
-  const rows = { // rows without a value are omitted
+  const rows = { // any row without a value is omitted
     "this page draws": drawn.length > 1 && `${drawn.length} pictures per second`,
     "the panels receive": now.fps_now > 0 && `${number(now.fps_now)} refreshes per second`,
     "the solver makes": solves ? `${number(now.solutions_per_s_now)} solutions per second (${now.model})` : now.paused ? "nothing: it is paused" : rests && "nothing new while the head rests",
@@ -308,7 +308,7 @@ async function report() {
     if (starting && now.reason) starting.textContent = `Starting: ${now.reason}. The first start on a machine takes about ten seconds longer.`;
     if (look && now.ok) figures(now, asked_ms);
   } catch {
-    // The handler of the closed connection reports the failure.
+    // The failure is reported by the handler for closed connections.
   }
   setTimeout(report, document.hidden ? 4 * STATUS_MS : STATUS_MS);
 }

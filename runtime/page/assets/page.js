@@ -1,11 +1,11 @@
-// Script of the operator's page, which polls the daemon, draws the daemon's state and posts commands. The page loads
-// data only from the server that delivered the page.
+// Script for the operator's page: polls the daemon, draws its state and posts commands. Data is loaded only from the
+// server that delivered the page.
 import { drawPlan } from "/display.js";
 import { ask, keep, token } from "/session.js";
 
 const $ = (id) => document.getElementById(id);
 const SVG = "http://www.w3.org/2000/svg";
-const KEPT = 240; // number of points in a plot, which cover two minutes
+const KEPT = 240; // number of points in a plot, which covers two minutes
 const STATUS_MS = 500, PICTURES_MS = 400, LOG_MS = 1000, ABOUT_MS = 5000, RETRY_MS = 1000;
 const ZOOMED_SIGMAS = 20; // radius of the drawn uncertainty: two standard deviations, enlarged ten times
 
@@ -30,7 +30,7 @@ function setText(node, text) {
   if (node.textContent !== text) node.textContent = text;
 }
 
-// Age of a solution, which is 0 if the solution is for an instant after the display time.
+// A solution's age, or 0 if it was computed for a time after the display time.
 const age = (value) => (typeof value === "number" ? Math.max(0, value) : value);
 const number = (value, digits = 1) => (value === null || value === undefined ? "–" : Number(value).toFixed(digits));
 const clock = (seconds) => new Date(seconds * 1000).toLocaleTimeString([], { hour12: false });
@@ -70,13 +70,13 @@ function plot(status) {
     const least = Math.min(0, ...known);
     const begin = KEPT - p.values.length;
     const height = (v) => (54 - (52 * (v - least)) / (most - least)).toFixed(1);
-    // The curve has gaps where values are unknown.
+    // Leave a gap in the curve where a value is unknown.
     const steps = p.values.map((v, i) => v === null ? "" : `${i && p.values[i - 1] !== null ? "L" : "M"}${begin + i},${height(v)}`);
     p.curve.setAttribute("d", steps.join(""));
   }
 }
 
-// Plans of the eyes and panels from above and from the side.
+// Plans of the eyes and panels, seen from above and from the side.
 
 function view(svg, status, axis, range) {
   const sigma_m = ((status.eye_sigma_now_mm ?? 0) / 1000) * ZOOMED_SIGMAS;
@@ -202,7 +202,7 @@ function playlist(told) {
   $("next").hidden = !told;
 }
 
-// Placement of the scene, which is sent after every change.
+// The scene's placement, sent after every change.
 
 const PLACE = [
   ["p-scale", "scale", null, 1], ["p-turntable", "turntable_per_min", null, 1],
@@ -216,7 +216,7 @@ function placing(told) {
   placed = told;
   for (const [id, name, part, units] of PLACE) {
     const value = (part === null ? told[name] : told[name][part]) * units;
-    // Do not overwrite values that are being typed or have not been sent yet.
+    // Do not overwrite a value that is being typed or has not been sent yet.
     if (document.activeElement !== $(id) && !waiting && !sending) $(id).value = Number(value.toFixed(4));
   }
 }
@@ -247,7 +247,7 @@ $("place-reset").addEventListener("click", () => tell($("place-reset"), "place",
 
 // Polling.
 
-let loggedIn = Promise.resolve(); // resolved when the user has entered a token
+let loggedIn = Promise.resolve(); // resolved once the user has entered a token
 
 function logIn() {
   if ($("login").open) return;
@@ -286,7 +286,7 @@ function gone(why, hangs = false) {
 }
 
 function show(status) {
-  if (!running) { // the daemon has been missing, so clear the error messages
+  if (!running) { // the daemon was missing until now, so clear the error messages
     for (const told of document.querySelectorAll('[data-kind="bad"]')) setText(told, "");
   }
   running = true;
@@ -298,7 +298,7 @@ function show(status) {
   setText($("state"), hangs ? "hangs" : late ? "late" : status.state ?? "starting");
   $("state").dataset.state = hangs ? "gone" : late ? "holding" : (status.state ?? "starting").split(":")[0];
   setText($("reason"), late ? `${reason}: use the model "fast" or fewer pixels (the panels still follow the eyes)` : reason);
-  if (status.state === undefined) return; // there has been no refresh yet
+  if (status.state === undefined) return; // no refresh yet
   document.querySelector('[data-command="pause"]').setAttribute("aria-pressed", String(status.paused));
   document.querySelector('[data-command="flat"]').setAttribute("aria-pressed", String(status.flat_asked));
   for (const [id, value] of [["scene", status.scene], ["model", status.model_asked]]) {

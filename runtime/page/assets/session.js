@@ -1,4 +1,4 @@
-// The browser stores the token for this address and port only, so no other server receives the token.
+// The browser stores the token only for this address and port, so it is not sent to any other server.
 const key = new URL(location.href).searchParams.get("token");
 if (key) {
   localStorage.setItem("token", key);
