@@ -261,7 +261,7 @@ def leaning(folder: Path) -> None:
 def light_of(eye_m: F64, layers: U8, stack: PanelStack, *, fov_deg: float) -> U8:
     """Compute the picture (h, w, 3) that an eye sees of the layers, averaged over the pupil.
 
-    Rays that miss a panel are black. `eye_m` is the eye's position (3,) in the frame `stack`.
+    Rays that miss a panel are black. `eye_m` is the eye's position (3,) in the `stack` frame.
     """
     points = pupil_points(PUPIL_MM / 1000) @ stack_from_eye(eye_m)[:3, :2].T
     seen = average(

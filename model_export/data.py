@@ -38,7 +38,7 @@ def random_stack(random: Random, *, width_px: int, height_px: int) -> PanelStack
 
 
 def random_eyes(random: Random, stack: PanelStack) -> F64:
-    """Return random positions (2, 3) of the left and the right eye in the frame `stack`.
+    """Return random positions (2, 3) of the left and the right eye in the `stack` frame.
 
     The head is 0.1 to 4 m from the origin and at least 0.1 m in front of the panels, and may be rolled and turned.
     """
@@ -64,7 +64,7 @@ def is_served(eyes_m: F64, stack: PanelStack) -> bool:
     """Return True if each eye sees at least `LEAST_COMMON` of the middle panel through all panels.
 
     Args:
-        eyes_m: Positions (2, 3) of the eyes in the frame `stack`.
+        eyes_m: Positions (2, 3) of the eyes in the `stack` frame.
         stack: Geometry of three panels.
     """
     for eye in eyes_m:

@@ -80,7 +80,7 @@ class Views:
 
         Args:
             stack: Geometry of the panels.
-            eyes_m: Positions (2, 3) of the left and the right eye in the frame `stack`.
+            eyes_m: Positions (2, 3) of the left and the right eye in the `stack` frame.
             width_px: Width of the raster.
             height_px: Height of the raster.
             fov_deg: Horizontal field of view of the pictures, or None for the raster of the middle panel.

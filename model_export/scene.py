@@ -40,7 +40,7 @@ def draw(scene: Scene, projection: F64, *, width_px: int, height_px: int) -> U8:
 
     Args:
         scene: Planes in drawing order.
-        projection: Projection (3, 4) from homogeneous metres in the frame `stack` to homogeneous pixels.
+        projection: Projection (3, 4) from homogeneous metres in the `stack` frame to homogeneous pixels.
         width_px: Width of the picture.
         height_px: Height of the picture.
     """
@@ -110,7 +110,7 @@ def _shift(right: float, down: float) -> F64:
 
 
 def random_scene(random: Random, stack: PanelStack, middle_m: F64) -> Scene:
-    """Return a random scene for a viewer whose head is near `middle_m` (3,) in the frame `stack`.
+    """Return a random scene for a viewer whose head is near `middle_m` (3,) in the `stack` frame.
 
     The scene has a backdrop and cards at random depths behind and in front of the panels.
     """
@@ -127,7 +127,7 @@ def random_scene(random: Random, stack: PanelStack, middle_m: F64) -> Scene:
         """Return a card with a random texture.
 
         Args:
-            x_m: Depth of the card in the frame `stack`.
+            x_m: Depth of the card in the `stack` frame.
             size_m: Width and height (2,) of the card.
             aside: Position (2,) at which the viewer sees the card on the middle panel, relative to the panel's size.
             slant: Largest angle in radians by which the card is turned.

@@ -186,11 +186,11 @@ def solve(
             must be taken by a pinhole camera at the eye that looks at the stack's origin without roll.
         right: Picture for the right eye, of the same size.
         stack: Geometry of the panels.
-        eyes_m: Positions of the left and the right eye in metres, in the frame `stack` (+x out of the screen, +y to
+        eyes_m: Positions of the left and the right eye in metres, in the `stack` frame (+x out of the screen, +y to
             the viewer's right, +z up). Required unless `cameras` is given.
         fov_deg: Horizontal field of view of the pictures, in degrees.
         cameras: Two 3x4 matrices for pictures that were taken by other pinhole cameras, such as parallel or shifted
-            ones. A matrix maps homogeneous metres in the frame `stack` to homogeneous pixels, with +u right, +v down
+            ones. A matrix maps homogeneous metres in the `stack` frame to homogeneous pixels, with +u right, +v down
             and pixel centres at half-integers. It is K·[R | t] with OpenCV's axes; add half a pixel to the principal
             point if K assumes pixel centres at integers. The cameras replace `eyes_m` and `fov_deg`: the pictures are
             resampled to look at the stack's origin and to cover the panels before they are solved and measured.
@@ -335,11 +335,11 @@ def camera(eye_m: Sequence[float] | F64, *, width_px: int, height_px: int, fov_d
     """Return the matrix (3, 4) of the pinhole camera that `solve` assumes at an eye by default.
 
     The camera looks at the stack's origin, and its rows of pixels are parallel to the ground. The matrix maps
-    homogeneous metres in the frame `stack` to homogeneous pixels, whose third coordinate is the distance along the
+    homogeneous metres in the `stack` frame to homogeneous pixels, whose third coordinate is the distance along the
     gaze in metres.
 
     Args:
-        eye_m: Position of the eye in metres, in the frame `stack`.
+        eye_m: Position of the eye in metres, in the `stack` frame.
         width_px: Width of the picture.
         height_px: Height of the picture.
         fov_deg: Horizontal field of view in degrees.
@@ -362,8 +362,8 @@ def project(
     """Project points to the pixels of an eye's picture.
 
     Args:
-        points_m: Points (..., 3) in metres, in the frame `stack`.
-        eye_m: Position of the eye in metres, in the frame `stack`.
+        points_m: Points (..., 3) in metres, in the `stack` frame.
+        eye_m: Position of the eye in metres, in the `stack` frame.
         width_px: Width of the picture.
         height_px: Height of the picture.
         fov_deg: Horizontal field of view in degrees.
