@@ -4,9 +4,9 @@ A mark is a white square that contains an ArUco marker and has a smaller white s
 a saddle point where two squares touch. A saddle point looks the same after a half turn, so it can be located to within
 a few hundredths of a pixel despite blur and the camera's tone curve.
 
-The rest of a board is black (phase 0) and lets the marks of the other panels show through. A single photograph
-therefore shows the marks of all panels, and no tripod is needed. The marks are placed irregularly so that marks that
-overlap as seen from one viewpoint are separate as seen from another.
+The rest of a board is black (phase 0) and lets the other panels' marks show through. A single photograph therefore
+shows every panel's marks, and no tripod is needed. The marks are placed irregularly so that marks that overlap as seen
+from one viewpoint are separate as seen from another.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MARKER_BITS = 4
 DICTIONARY_SIZE = 100
 ACROSS, DOWN = 5, 4  # number of marks across and down a panel
 PER_PANEL = ACROSS * DOWN
-BITS_ON_SHORT_SIDE = 216  # marker bits along the shorter side of a panel; a bit is 5 pixels wide at 1080 rows
+BITS_ON_SHORT_SIDE = 216  # marker bits along a panel's shorter side; a bit is 5 pixels wide at 1080 rows
 # Sizes in bits: the marker with its black border, the quiet zone on each side, and a corner square.
 MARKER, QUIET, CORNER = MARKER_BITS + 2, 2, 3
 SQUARE = MARKER + 2 * QUIET

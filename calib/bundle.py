@@ -1,8 +1,8 @@
 """Estimate every panel's pose by bundle adjustment, together with one camera's lens and poses.
 
-The known pixel pitch of the panels sets the scale. The reference panel is fixed at its ideal pose and defines the
-stack's frame; every other panel has six degrees of freedom. A robust fit (soft L1) first identifies outliers, and
-ordinary least squares on the remaining points then gives an unbiased covariance.
+The panels' known pixel pitch sets the scale. The reference panel is fixed at its ideal pose and defines the stack's
+frame; every other panel has six degrees of freedom. A robust fit (soft L1) first identifies outliers, and ordinary
+least squares on the remaining points then gives an unbiased covariance.
 
 The derivatives are exact. The normal equations are small: about a hundred unknowns for thousands of coordinates.
 SciPy's `least_squares` gives the same covariance (to 1e-11) but takes 30 times as long, because it decomposes the
@@ -30,7 +30,7 @@ POSE = 6  # parameters of a pose: rotation vector, translation
 FOCAL_GUESSES = (0.6, 0.8, 1.1, 1.6, 2.4)  # initial focal lengths, relative to the photograph's longer side
 ROBUST_PX = 0.3  # scale of the soft L1 norm
 OUTLIER_SIGMAS = 4.0  # distance, in standard deviations, beyond which a point is an outlier
-MIN_SIGMA_PX = 0.01  # minimum noise assumed for the points, which keeps exact data free of outliers
+MIN_SIGMA_PX = 0.01  # minimum noise assumed for the points, so that exact data have no outliers
 NO_FIT_PX = 5.0  # median distance beyond which the photographs cannot be of the configured stack
 MAX_STEPS, MAX_DAMPING = 60, 1e8
 # Prior standard deviations that suit any camera: square pixels, a centred lens and a few percent of distortion. A dozen
@@ -50,7 +50,7 @@ class Bundle:
     reference: int  # index of the reference panel
     places_m: F64  # (P, 3) camera positions, frame `stack`
     covariance: F64  # (6(N-1), 6(N-1)): rotation about the centre (rad) and shift (m) of each non-reference panel
-    sigma_px: float  # standard deviation of one coordinate of a saddle point in a photograph
+    sigma_px: float  # standard deviation, per coordinate, of the saddle points in a photograph
     used: NDArray[np.bool_]  # (K,) True for points that are not outliers
     photograph: Any  # (K,) index of the photograph that shows each point
 
@@ -83,8 +83,8 @@ class _State:
     """Current estimate of the lens, the panels' poses and the camera's poses."""
 
     lens: F64  # (9,) fx, fy, cx, cy, k1, k2, p1, p2, k3 as in OpenCV
-    turns: F64  # (N, 3, 3) rotations of the panels, stack_from_panel
-    middles_m: F64  # (N, 3) centres of the panels, frame `stack`
+    turns: F64  # (N, 3, 3) the panels' rotations, stack_from_panel
+    middles_m: F64  # (N, 3) the panels' centres, frame `stack`
     poses: F64  # (P, 4, 4) camera_from_stack for each photograph
 
     @property
@@ -236,9 +236,9 @@ def _solved(problem: _Problem, state: _State, used: NDArray[np.bool_], *, robust
 def _refuse_reverse(problem: _Problem, state: _State) -> None:
     """Raise Undetermined if the order of the panels is the reverse of the configured order.
 
-    The order is reversed if the configured order fits only with a camera behind the stack, or if it does not fit and
-    the reverse order does. (A camera behind the stack would take the same pictures as one in front of a stack that is
-    mirrored front to rear.)
+    The order counts as reversed if the configured order fits only with a camera behind the stack, or if it does not fit
+    but the reverse order does. (A camera behind the stack would take the same pictures as one in front of a stack that
+    is mirrored front to rear.)
     """
     depth_m = problem.camera_m(state)[:, 2]
     behind = any(np.median(depth_m[problem.photograph == number]) <= 0 for number in range(problem.photographs))
@@ -256,10 +256,10 @@ def _median_px(problem: _Problem, state: _State) -> float:
 
 
 def adjust(seen: Sequence[SeenMarks], stack: PanelStack, *, reference: int) -> Bundle:
-    """Estimate the poses of all panels from photographs of the boards.
+    """Estimate every panel's pose from photographs of the boards.
 
     Args:
-        seen: Saddle points of each photograph. All photographs must have the same size and come from one camera.
+        seen: Saddle points found in each photograph. All photographs must have the same size and come from one camera.
         stack: Configured geometry, used as the starting point of the fit.
         reference: Index of the panel that defines the `stack` frame.
 

@@ -28,7 +28,7 @@ from runtime.sensor.registry import open_sensor
 from runtime.sensor.samples import RecordedSamples
 
 WINDOW_NS = NS_PER_S // 2  # length of the window whose samples are combined by their median
-MAX_SPREAD_M = 0.010  # maximum motion or scatter of the eyes during this time
+MAX_SPREAD_M = 0.010  # maximum motion or scatter of the eyes within the window
 MIN_SAMPLES = 5  # minimum number of samples for a meaningful spread
 
 
@@ -44,7 +44,7 @@ class EyeWindow:
     """Midpoints between the eyes from the last half second. Their median gives a steady position."""
 
     def __init__(self) -> None:
-        self._samples: deque[tuple[int, F64]] = deque()  # capture time and midpoint of the eyes
+        self._samples: deque[tuple[int, F64]] = deque()  # capture time and midpoint between the eyes
 
     def add(self, capture_ns: int, eyes: EyePoints | None) -> None:
         """Add a sample in the sensor frame, and drop any that are more than half a second old.
@@ -167,7 +167,7 @@ class Walk:
         index = min(max(self._index + step, 0), len(self._left) - 1)
         if index != self._index:
             self._index = index
-            self._window = EyeWindow()  # drops the samples of the previous viewpoint
+            self._window = EyeWindow()  # drops the previous viewpoint's samples
             self._announce()
 
     def _announce(self) -> None:
@@ -220,7 +220,7 @@ def capture_live(
 
 
 def capture_recording(out: Path, settings: Settings, *, source: str) -> dict[str, Any]:
-    """Write a pair for every sample of a recording that contains the true eye positions.
+    """Write a pair for every sample in a recording that includes the true eye positions.
 
     Args:
         out: CSV file for the pairs. If it exists, pairs are added to it.

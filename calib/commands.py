@@ -37,9 +37,9 @@ def panels(
 ) -> None:
     """Measure every panel's pose, with standard errors, from photographs of coded boards.
 
-    First show the boards with --show. In a dim room, take 8 to 20 hand-held photographs in which the display fills most
-    of the picture, all with the same camera and zoom. Take them from the middle, left, right, above and below, up to 40
-    degrees off the axis, and a few in portrait. Then pass their folder as --photos.
+    First show the boards with --show. In a dim room, take 8 to 20 hand-held photographs, all with the same camera and
+    zoom and with the display filling most of the picture. Take them from the middle, left, right, above and below, up
+    to 40 degrees off the axis, and a few in portrait. Then pass their folder as --photos.
 
     Example: phasestack calibrate panels --photos photos --config phasestack.toml --write --out registration
     """

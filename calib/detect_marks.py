@@ -12,9 +12,9 @@ from calib.board import MARKER, Mark, dictionary, marks
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
 
-DETECTION_PX = 2400  # size of the copy that is searched for marks; corners are located in the original photograph
-MIN_MARKS = 3  # minimum number of marks per panel, which is twelve points
-MIN_EXTENT = 0.3  # share of a panel that its marks must span, because marks in one corner hardly determine the panel
+DETECTION_PX = 2400  # size of the copy searched for marks; corners are located in the original photograph
+MIN_MARKS = 3  # minimum number of marks per panel (twelve points)
+MIN_EXTENT = 0.3  # share of a panel that its marks must span, because marks in one corner barely determine the panel
 MIN_UNIT_PX = 1.7  # minimum size of a marker bit in the photograph
 BLURRED_BITS = 1.1  # maximum width of an edge, in marker bits
 MIN_CONTRAST = 0.35  # minimum contrast at a saddle point, relative to the mark's contrast
@@ -25,7 +25,7 @@ MIN_DYNAMIC = 24  # minimum difference between black and white in 8-bit levels
 class SeenMarks:
     """Saddle points found in one photograph."""
 
-    name: str  # file name of the photograph
+    name: str  # the photograph's file name
     width_px: int
     height_px: int
     panel: Any  # (K,) index of the panel that shows each point

@@ -33,7 +33,7 @@ from runtime.support.artifacts import write_text
 
 GREYS = tuple(round(255 * step / 12) for step in range(13))
 SHARES = tuple(step / 16 for step in (1, 2, 4, 6, 8, 11, 14))  # shares of white pixels in the mixed patches
-PATCHES_ACROSS = 32  # number of patches across the width of a panel
+PATCHES_ACROSS = 32  # number of patches across a panel's width
 MARGIN = 0.15  # share of a panel left free at each edge, because the edges look dark from nearby
 INNER = 0.5  # share of a patch's side that is measured
 SAMPLES = 24  # number of samples along each side of a patch
@@ -192,7 +192,7 @@ def measure(pictures: list[F64], stack: PanelStack, panel: int, *, source: str) 
     a quadratic polynomial in position) and the intensities of the greys.
 
     Args:
-        pictures: Histograms (P, 256) of the patches in each photograph.
+        pictures: Each photograph's patch histograms (P, 256).
         stack: Panel geometry.
         panel: Index of the panel that shows the chart.
         source: Origin of the photographs, used in error messages.

@@ -71,7 +71,7 @@ class TerminalKeys:
         self._quit_at_end = quit_at_end
         self._descriptor = _standard_input() if descriptor is None else descriptor
         self._rest = b""
-        self._mode: Any = None  # previous mode of the terminal
+        self._mode: Any = None  # the terminal's previous mode
 
     def poll(self) -> Key | None:
         """Return the next key without waiting, or None if no key was pressed."""
@@ -103,7 +103,7 @@ class TerminalKeys:
         return data.decode(errors="replace").strip() if self._descriptor >= 0 else "q"
 
     def close(self) -> None:
-        """Restore the previous mode of the terminal. Further calls have no effect."""
+        """Restore the terminal's previous mode. Further calls have no effect."""
         if self._mode is not None:
             import termios
 

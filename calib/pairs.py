@@ -42,7 +42,7 @@ Number = Annotated[float, BeforeValidator(_no_truth_value), AfterValidator(_boun
 
 
 class PairRow(BaseModel):
-    """A row of the file: a pair of points in metres, with the columns that `calibrate capture` adds."""
+    """A row in the file: a pair of points in metres, with the columns that `calibrate capture` adds."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", coerce_numbers_to_str=True)
 
@@ -76,7 +76,7 @@ class Pairs:
     sensor_m: F64  # (K, 3) measured points, frame `sensor`
     stack_m: F64  # (K, 3) known points, frame `stack`
     names: tuple[str, ...]  # names of the pairs, used in messages
-    source: str  # path of the file
+    source: str  # the file's path
     sensor_serial: str = ""  # serial number of the sensor that measured all pairs; empty if unknown
 
     def __len__(self) -> int:

@@ -33,7 +33,7 @@ MIN_PHOTOGRAPHS = 5  # minimum number of usable photographs
 MIN_SPAN_DEG = 15.0  # minimum angle between the two photographs whose directions differ most
 DISAGREES = 0.4  # share of outliers above which a photograph is excluded
 MISFIT_PX = 1.5  # residual above which the stack is not rigid or has moved
-IMPLAUSIBLE_M = 0.010  # displacement of a panel that is too large to be an error in manual assembly
+IMPLAUSIBLE_M = 0.010  # panel displacement that is too large to be an error in manual assembly
 DOUBTFUL_PX = 0.3  # corner uncertainty above which a registration is refused
 
 
@@ -41,15 +41,15 @@ DOUBTFUL_PX = 0.3  # corner uncertainty above which a registration is refused
 class Registration:
     """The stack's measured geometry and the panels' homographies, with their uncertainties."""
 
-    bundle: Bundle  # poses of the panels and the camera
+    bundle: Bundle  # poses of the panels and camera positions
     stack: PanelStack  # geometry to configure, with actual distances and tilts
     gap_sigma_m: F64  # (N-1,) standard deviations of the gaps
     homographies: F64  # (N, 3, 3) from ideal pixels of `stack` to pixels of the actual panels
     corners_px: F64  # (N, 4, 2) displacements of the corners (0, 0), (W, 0), (W, H), (0, H)
     corner_sigma_px: F64  # (N, 4, 2) standard deviations of the displacements
-    eye_m: F64  # (3,) viewing position for which the homographies are exact, frame `stack`
+    eye_m: F64  # (3,) viewing position where the homographies are exact, frame `stack`
     used: int  # number of photographs used
-    notes: list[str]  # names of the excluded photographs, with reasons
+    notes: list[str]  # the excluded photographs' names, with reasons
 
     @property
     def sigma_panel_px(self) -> F64:
@@ -72,7 +72,7 @@ def geometry_of(panels: Sequence[PlacedPanel], stack: PanelStack, *, eye_m: F64)
     """Return the geometry to configure for panels at their measured poses.
 
     Args:
-        panels: Poses of the panels from rear to front.
+        panels: The panels' poses, from rear to front.
         stack: Configured geometry, whose distances and tilts are replaced.
         eye_m: Viewing position (3,) that the panels are registered for, in the `stack` frame.
 

@@ -37,7 +37,7 @@ class StoredPairs(Lenient):
 
 
 class Points(NamedTuple):
-    """A calibration's errors at the pairs that were used to compute it."""
+    """A calibration's errors at the pairs used to compute it."""
 
     names: tuple[str, ...]
     residual_m: F64  # (K, 3) calibrated minus true positions, frame `stack`

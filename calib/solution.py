@@ -36,7 +36,7 @@ class CalibrationSolution:
     similarity: Similarity  # from the `sensor` frame to the `stack` frame
     residual_m: F64  # (K, 3) fitted minus known positions of all pairs, frame `stack`
     used: NDArray[np.bool_]  # (K,) False for pairs that were rejected as outliers
-    noise_m: float  # standard deviation of one coordinate of the used pairs, frame `stack`
+    noise_m: float  # standard deviation, per coordinate, of the used pairs, frame `stack`
     pivot_m: F64  # (3,) centre of the used pairs, frame `stack`
     unit_covariance: F64  # (7, 7) covariance for noise of 1 m, with zeros for a scale that is known exactly
     condition: float  # condition number of the design matrix, with lengths in units of the pairs' RMS radius
@@ -72,7 +72,7 @@ class CalibrationSolution:
 
         Args:
             stack_m: Points (..., 3) in the `stack` frame.
-            noise_m: Standard deviation of one coordinate of the pairs. Defaults to the observed noise.
+            noise_m: Standard deviation of the pairs, per coordinate. Defaults to the observed noise.
 
         Returns:
             An array (...) with the error at each point.
@@ -155,7 +155,7 @@ def posterior_scale(fitted: float, *, sigma: float, freedom: int) -> tuple[float
     fitted scale nearly unchanged for a sensor whose scale is off by a tenth.
 
     Args:
-        fitted: Fitted logarithm of the scale.
+        fitted: Logarithm of the fitted scale.
         sigma: Standard deviation of `fitted`, as estimated from the residuals.
         freedom: Degrees of freedom of the estimate `sigma`. They make the likelihood a Student's t distribution.
     """

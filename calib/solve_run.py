@@ -35,7 +35,7 @@ def solve_file(
         pairs_path: CSV or JSON file with the pairs.
         out: Calibration file to write. The version it replaces is kept.
         settings: Sensor, panel and viewing range configuration.
-        method: Name of a method. If empty, the method with the least expected error at the eye is chosen.
+        method: Method name. If empty, the method with the least expected error at the eye is chosen.
         known_scale: Scale for the `fixed-scale` method.
 
     Returns:

@@ -1,6 +1,6 @@
 """Write docs/performance.md and the documentation's pictures, based on a demo and a report.
 
-Run `make gallery`, which takes minutes, or
+Run `make gallery`, which takes several minutes, or
 
     python -m docs.make_gallery [--work FOLDER] [--keep] [REPORT OPTION ...]
 

@@ -28,8 +28,8 @@ def ball_and_ground(width: int, height: int, eye_x: float = 0.0) -> tuple[Image.
     """Draw a ball and bars in front of a background, and a depth map where white is nearest.
 
     Args:
-        width: Width of the pictures.
-        height: Height of the pictures.
+        width: Picture width.
+        height: Picture height.
         eye_x: The ball's shift in pixels, used to draw another view; nearer parts of the scene shift more.
     """
     colour, depth = Image.new("RGB", (width, height), (235, 225, 205)), Image.new("L", (width, height), 50)

@@ -20,7 +20,7 @@ from pydantic import BaseModel, Field
 
 import phasestack
 
-RING_M = 0.04  # length of a ring of tiles
+RING_M = 0.04  # length of each ring of tiles
 TILES = 16  # number of tiles in a ring
 DARK_AFTER_M = 0.5  # depth over which the brightness falls by a factor of e
 

@@ -13,8 +13,8 @@ are nearly independent. Therefore
 where w_nq is the share of the bundle covered by pixel q on panel n. The shares are bilinear weights if the bundle is as
 wide as a pixel.
 
-*A step.* Let T be the target and e = I - T the residual, which is 0 if a ray misses a panel. Consider changing all
-pixels of a panel that a bundle crosses by the same amount. The derivative of the squared error, and a bound on its
+*A step.* Let T be the target and e = I - T the residual, which is 0 if a ray misses a panel. Consider changing, by the
+same amount, all of a panel's pixels that a bundle crosses. The derivative of the squared error, and a bound on its
 curvature, are then sums over all sets of rays:
 
     g_q = sum w·e·Im Z            (pi/2·g is the derivative of sum e²/2)                                      (L3)
@@ -47,7 +47,7 @@ from runtime.optics.rpu import panel_from_image
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack
 
-NEAR_PX = 0.5  # minimum distance of a valid ray from the edges of every panel
+NEAR_PX = 0.5  # a valid ray passes at least this far inside every panel's edges
 SIZE = 0.8  # size of the steps that follow a trained network; larger steps overshoot when the initial values are poor
 MOMENTUM, FLOOR = 0.7, 0.1
 LEAST_ERROR = 1e-6  # minimum squared error, which limits the PSNR to 60 dB
@@ -81,8 +81,8 @@ class Views:
         Args:
             stack: Panel geometry.
             eyes_m: Left and right eye positions (2, 3) in the `stack` frame.
-            width_px: Width of the raster.
-            height_px: Height of the raster.
+            width_px: Raster width.
+            height_px: Raster height.
             fov_deg: The pictures' horizontal field of view, or None for the middle panel's raster.
             places_m: Displacements (P, 3) of both eyes. Each displacement adds two sets of rays, which pass through the
                 same points on the middle panel.
@@ -183,7 +183,7 @@ def step(
             the views, each of k head positions uses every k-th row.
         views: The eyes' rays.
         size: Step size.
-        momentum: Momentum of the extrapolation.
+        momentum: Momentum used to extrapolate.
         floor: Lower limit for the curvature per set of rays.
 
     Returns:
@@ -210,8 +210,8 @@ def improved(panels: Tensor, targets: Tensor, views: Views, sizes: Sequence[Any]
         panels: Initial panel values (N, C, H, W).
         targets: Target intensities (2, C, h, w) for the left and the right eye.
         views: The eyes' rays.
-        sizes: Size of each step.
-        momenta: Momentum of each step.
+        sizes: Each step's size.
+        momenta: Each step's momentum.
     """
     x = y = panels
     for size, momentum in zip(sizes, momenta, strict=True):

@@ -144,7 +144,7 @@ def probe(network: Network, *, width_px: int, height_px: int) -> None:
 
 
 def check_static(network: Network, *, width_px: int, height_px: int) -> None:
-    """Raise InputError if the network branches on the values of its input.
+    """Raise InputError if the network branches on its input's values.
 
     A graph cannot represent such branches.
     """

@@ -63,8 +63,8 @@ class SpectralSolver(nn.Module):
             eye_sigma_px: The input of `forward` with this name (3,).
 
         Returns:
-            The numerator and the denominator of the gain of g, which excludes the part that h explains, and the gain of
-            h. All three have the shape (patterns, cells + 1).
+            The numerator and denominator of g's gain, which excludes the part explained by h, and h's gain. All three
+            have shape (patterns, cells + 1).
         """
         scale = torch.exp(self.log_sigma_scale)
         # The product of a chain mode and a block's pattern is two waves, at the pattern's frequency ± `offset`.
@@ -93,16 +93,16 @@ class SpectralSolver(nn.Module):
         Args:
             *feeds: The tensors named in `INPUTS`.
 
-                * `left`, `right`: residual of each eye along the eye's rays through the raster, (rows, cells, 2K·C)
-                  16-bit codes.
+                * `left`, `right`: each eye's residual along its rays through the raster, (rows, cells, 2K·C) 16-bit
+                  codes.
                 * `waves`, `shifted_waves`, `spectrum`, `modes_in`: V and Ũ (cells + 1, cells + 1), s (cells + 1,) and
-                  U^T (cells + 1, cells) of `runtime.model.chain.chain_modes`.
-                * `cell_waves`, `cell_frequencies`: (2K, 2K) and (2K,) of `runtime.model.chain.cell_waves`.
-                * `eye_sigma_px`: c, r and e (3,). The unit of c and e is the parallax divided by `cell_px`, the unit of
-                  r is a row.
+                  U^T (cells + 1, cells) from `runtime.model.chain.chain_modes`.
+                * `cell_waves`, `cell_frequencies`: (2K, 2K) and (2K,) from `runtime.model.chain.cell_waves`.
+                * `eye_sigma_px`: c, r and e (3,). c and e are in units of the parallax divided by `cell_px`, and r is
+                  in rows.
 
         Returns:
-            The rear and the front panel, (rows, cells + 1, 2K·C) 16-bit codes that begin one parallax before column 0,
+            The rear and front panels, as (rows, cells + 1, 2K·C) 16-bit codes that begin one parallax before column 0,
             and a number (1,) that is finite if all intermediate results are finite.
         """
         rear, front, check = self._solved(feeds, added=0.5)

@@ -79,8 +79,8 @@ def _exported(
     Args:
         net: Module to export, in evaluation mode.
         example: Example inputs.
-        inputs: Names of the inputs.
-        outputs: Names of the outputs.
+        inputs: Input names.
+        outputs: Output names.
         axes: Names of the dimensions, keyed by input or output. Dimensions not listed in `FIXED` are variable.
         folded: Fold constants. If False, the weights keep their names.
     """

@@ -47,7 +47,7 @@ class TrainingPairs(Dataset[dict[str, Tensor]]):
     width_px: int  # width of the panels and the pictures
     height_px: int  # height of the panels and the pictures
     eye_sigma_mm: float  # standard deviation of the tracking error along one axis
-    count: int = 0  # number of different pairs, after which they repeat; 0 means unlimited
+    count: int = 0  # number of different pairs before they repeat; 0 means unlimited
     stack: PanelStack | None = None  # panel geometry, or None for random panels
     folder: tuple[Pair, ...] = ()  # pairs to use; if empty, pairs are rendered or generated
     scene: str = ""  # scene to render at random rotations about the vertical axis; if empty, pairs are generated
@@ -137,7 +137,7 @@ def prototype(*, width_px: int, height_px: int) -> PanelStack:
 
 
 def photographed(pair: Pair, stack: PanelStack, fov_deg: float) -> TrainingPair:
-    """Resample a published pair as if the eyes looked at the centre of the display.
+    """Resample a published pair as if the eyes looked at the display's centre.
 
     Args:
         pair: Pair to resample.

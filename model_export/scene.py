@@ -41,8 +41,8 @@ def draw(scene: Scene, projection: F64, *, width_px: int, height_px: int) -> U8:
     Args:
         scene: Planes, in the order they are drawn.
         projection: 3x4 projection from homogeneous metres in the `stack` frame to homogeneous pixels.
-        width_px: Width of the picture.
-        height_px: Height of the picture.
+        width_px: Picture width.
+        height_px: Picture height.
     """
     width, height = width_px * FINER, height_px * FINER
     picture = np.zeros((height, width, 3), np.float32)
@@ -130,7 +130,7 @@ def random_scene(random: Random, stack: PanelStack, middle_m: F64) -> Scene:
             x_m: The card's depth in the `stack` frame.
             size_m: The card's width and height (2,).
             aside: Position (2,) where the viewer sees the card on the middle panel, relative to the panel's size.
-            slant: Maximum rotation of the card, in radians.
+            slant: The card's maximum rotation, in radians.
             see_through: Make the texture opaque only on lines.
         """
         share = (x_m - centre_m) / distance_m

@@ -35,7 +35,7 @@ from runtime.support.artifacts import write_bytes, write_text
 from runtime.support.progress import progress_bar
 
 HELD_OUT_SEED = 9_000_001  # seed for the validation pairs, greater than any training seed
-HELD_OUT, HELD_OUT_SHARE = 6, 8  # number of generated validation pairs; one in this many pairs of a folder is held out
+HELD_OUT, HELD_OUT_SHARE = 6, 8  # number of generated validation pairs; one in this many pairs in a folder is held out
 FIRST_SAVED = 10  # iteration of the first checkpoint, so that even a short training run can be resumed
 SMALL_PX = 30_000  # pixels per batch; up to this number, one thread is faster (17 s instead of 24 s at 160x90)
 COLUMNS = ("iteration", "light_db", "held_out_light_db")
@@ -273,7 +273,7 @@ def _resumed(
         *parts: Optimizer and learning rate scheduler, which receive their states.
 
     Returns:
-        The number of completed iterations, the learning curve, and the light PSNR of each iteration since the curve's
+        The number of completed iterations, the learning curve, and the light PSNR of every iteration since the curve's
         last point.
 
     Raises:

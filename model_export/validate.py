@@ -114,7 +114,7 @@ def check_model(data: bytes, *, source: str, reference: Reference | None = None)
 
 
 def _size(shape: Sequence[Any], contract: Contract) -> tuple[int, int]:
-    """Return the height and the width of the test pictures.
+    """Return the test pictures' height and width.
 
     They are taken from the graph or the contract. If neither fixes a size, `SMALL` is used.
     """

@@ -76,7 +76,7 @@ class Result:
     """
 
     layers: U8  # (panels, h, w, 3), rear to front
-    model: str  # name of the model that was used, with a note if its network does not support the stack
+    model: str  # name of the model used, with a note if its network does not support the stack
     eye_sigma_mm: float  # tracking error that the layers were computed for
     total_ms: float  # time the solver took, without loading the model
 
@@ -194,11 +194,11 @@ def solve(
             centres at half-integers. It is K·[R | t] with OpenCV's axes; add half a pixel to the principal point if K
             assumes pixel centres at integers. The cameras replace `eyes_m` and `fov_deg`: the pictures are resampled to
             look at the stack's origin and to cover the panels before they are solved and measured.
-        model: `fast`, `balanced`, `best`, `sart`, or the path of an ONNX file.
+        model: `fast`, `balanced`, `best`, `sart`, or the path to an ONNX file.
         eye_sigma_mm: Tracking error to allow for: 1 suits a good tracker, and 0 assumes exact positions.
 
     Raises:
-        ValueError: An argument is invalid. The message begins with the name of the argument.
+        ValueError: An argument is invalid. The message begins with the argument's name.
     """
     pair = _checked((left, right), stack=stack, eyes_m=eyes_m, fov_deg=fov_deg, cameras=cameras)
     eye_sigma_mm = _number("eye_sigma_mm", eye_sigma_mm, 0.0, 1000.0, "mm")
@@ -292,7 +292,7 @@ def evaluate(
         SSIM is then NaN.
 
     Raises:
-        ValueError: An argument is invalid. The message begins with the name of the argument.
+        ValueError: An argument is invalid. The message begins with the argument's name.
     """
     pair = _checked((left, right), stack=stack, eyes_m=eyes_m, fov_deg=fov_deg, cameras=cameras)
     given = as_array("layers", layers)
@@ -339,12 +339,12 @@ def camera(eye_m: Sequence[float] | F64, *, width_px: int, height_px: int, fov_d
 
     Args:
         eye_m: The eye's position in metres, in the `stack` frame.
-        width_px: Width of the picture.
-        height_px: Height of the picture.
+        width_px: Picture width.
+        height_px: Picture height.
         fov_deg: Horizontal field of view, in degrees.
 
     Raises:
-        ValueError: An argument is invalid. The message begins with the name of the argument.
+        ValueError: An argument is invalid. The message begins with the argument's name.
     """
     sizes = {"width_px": width_px, "height_px": height_px}
     for name, size in sizes.items():
@@ -363,15 +363,15 @@ def project(
     Args:
         points_m: Points (..., 3) in metres, in the `stack` frame.
         eye_m: The eye's position in metres, in the `stack` frame.
-        width_px: Width of the picture.
-        height_px: Height of the picture.
+        width_px: Picture width.
+        height_px: Picture height.
         fov_deg: Horizontal field of view, in degrees.
 
     Returns:
         Pixel coordinates (..., 2), or NaN for points behind the eye.
 
     Raises:
-        ValueError: An argument is invalid. The message begins with the name of the argument.
+        ValueError: An argument is invalid. The message begins with the argument's name.
     """
     points = np.asarray(points_m, np.float64)
     if points.ndim < 1 or points.shape[-1] != 3:

@@ -29,7 +29,7 @@ class PairQuality:
     that it sees no part of the panels. SSIM is NaN if it was not requested.
     """
 
-    light_db: BySigma  # with square pixels and a finite pupil; quote "1", the tracking error of a good tracker
+    light_db: BySigma  # with square pixels and a finite pupil; quote "1", a good tracker's tracking error
     expected_db: BySigma  # with one ray per pixel
     psnr_db: float  # with one ray per pixel, at exactly known eyes
     ssim: float

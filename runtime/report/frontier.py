@@ -95,7 +95,7 @@ class MethodRun:
 class PairResult:
     """One method's quality, run times and memory on one pair."""
 
-    pair: str  # name of the pair
+    pair: str  # pair name
     run_ms: tuple[float, ...]
     memory_mib: float
     quality: PairQuality

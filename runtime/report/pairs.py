@@ -45,7 +45,7 @@ class StillPair:
     name: str
     stack: PanelStack
     eyes_m: F64  # (2, 3) left and right eye, frame `stack`
-    images: tuple[U8, U8]  # (h, w, 3) pictures of the left and right eye
+    images: tuple[U8, U8]  # (h, w, 3) pictures for the left and right eyes
     fov_deg: float  # horizontal field of view
     off: tuple[OffView, ...] = ()  # further targets, for displaced eyes
 
@@ -162,8 +162,8 @@ class PairPainter:
         Args:
             eye_m: The eye's position, shape (3,), in the `stack` frame.
             pixels_from_stack: 3x4 projection from points in the `stack` frame to the picture's pixels.
-            width_px: Width of the picture.
-            height_px: Height of the picture.
+            width_px: Picture width.
+            height_px: Picture height.
         """
         from runtime.content.base import View
 
@@ -181,7 +181,7 @@ class PairPainter:
         """Draw a pair at a stack's resolution, with targets for displaced eyes.
 
         Args:
-            name: Name of the pair.
+            name: Pair name.
             eyes_m: Left and right eyes, shape (2, 3), in the `stack` frame.
             stack: Panel geometry and resolution.
             fov_deg: The pictures' horizontal field of view.

@@ -95,7 +95,7 @@ class StiffProblem:
         return self.gap_m + self.distance_m
 
     def target(self, side: int) -> F64:
-        """Return the target phase of each column for the left (0) or right (1) eye, shape (WIDTH_PX,)."""
+        """Return each column's target phase for the left (0) or right (1) eye, shape (WIDTH_PX,)."""
         return 1.5 + waves(COMMON) + (side - 0.5) * waves([(1, AMPLITUDE), *FINER])
 
     def condition(self) -> float:

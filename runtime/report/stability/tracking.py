@@ -25,7 +25,7 @@ def head_m(time_ns: int, *, span_ns: int) -> F64:
     """Return the left and right eyes of a uniformly moving head, shape (2, 3), in the `stack` frame.
 
     Args:
-        time_ns: Time since the start of the motion.
+        time_ns: Time since the motion started.
         span_ns: Time taken to move by TRAVEL_M, or by less if the head would otherwise exceed FASTEST.
     """
     share = min(1.0, FASTEST * span_ns / NS_PER_S / float(np.linalg.norm(TRAVEL_M)))

@@ -15,7 +15,7 @@ from runtime.errors import PhasestackError
 
 Behaviour = Literal["answers", "refuses"]
 EPS64 = 2.0**-52
-WORSE = 1.05  # maximum ratio of an error to the recorded error that is accepted
+WORSE = 1.05  # largest accepted ratio of an error to the recorded error
 
 
 @dataclass(frozen=True, slots=True)
