@@ -1,1 +1,1 @@
-"""Calibration of the sensor's pose, the registration of the panels and their grey curves."""
+"""Calibration of the sensor's pose, the panels' registration and their grey curves."""

@@ -1,12 +1,12 @@
 """Draw calibration boards with coded marks that identify a panel and a position on the panel.
 
-A mark is a white square that contains an ArUco marker and has a smaller white square at each corner. The point where
-two squares touch is a saddle point of the brightness. A saddle point looks the same after a half turn, so it can be
-located to a few hundredths of a pixel despite blur and the camera's tone curve.
+A mark is a white square that contains an ArUco marker and has a smaller white square at each corner. The brightness has
+a saddle point where two squares touch. A saddle point looks the same after a half turn, so it can be located to within
+a few hundredths of a pixel despite blur and the camera's tone curve.
 
-The rest of a board is black (phase 0) and lets the marks of the other panels show through. A single photograph
-therefore shows the marks of all panels, and no tripod is needed. The marks are placed irregularly, because marks that
-overlap from one viewpoint are then separate from another.
+The rest of a board is black (phase 0) and lets the other panels' marks show through. A single photograph therefore
+shows every panel's marks, and no tripod is needed. The marks are placed irregularly so that marks that overlap as seen
+from one viewpoint are separate as seen from another.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MARKER_BITS = 4
 DICTIONARY_SIZE = 100
 ACROSS, DOWN = 5, 4  # number of marks across and down a panel
 PER_PANEL = ACROSS * DOWN
-BITS_ON_SHORT_SIDE = 216  # marker bits along the shorter side of a panel; a bit is 5 pixels wide at 1080 rows
+BITS_ON_SHORT_SIDE = 216  # marker bits along a panel's shorter side; a bit is 5 pixels wide at 1080 rows
 # Sizes in bits: the marker with its black border, the quiet zone on each side, and a corner square.
 MARKER, QUIET, CORNER = MARKER_BITS + 2, 2, 3
 SQUARE = MARKER + 2 * QUIET
@@ -34,7 +34,7 @@ TILE = SQUARE + 2 * CORNER
 
 
 def dictionary() -> Any:
-    """Return the ArUco dictionary from which the markers are taken."""
+    """Return the ArUco dictionary that supplies the markers."""
     return cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_100)
 
 
@@ -42,26 +42,26 @@ def dictionary() -> Any:
 class Mark:
     """Position and identity of one mark on a panel's board."""
 
-    number: int  # id of the ArUco marker
+    number: int  # ArUco marker id
     panel: int  # index of the panel that shows the mark
-    left_px: int  # left edge of the white square
-    top_px: int  # top edge of the white square
-    unit_px: int  # side length of one bit of the marker
+    left_px: int  # the white square's left edge
+    top_px: int  # the white square's top edge
+    unit_px: int  # side length of one marker bit
 
     @property
     def side_px(self) -> int:
-        """Side length of the white square in pixels."""
+        """The white square's side length in pixels."""
         return SQUARE * self.unit_px
 
     @property
     def saddles_px(self) -> F64:
-        """Corners (4, 2) of the white square in panel pixels, clockwise from the top left."""
+        """The white square's corners in panel pixels, clockwise from the top left, as a (4, 2) array."""
         u, v, side = self.left_px, self.top_px, self.side_px
         return np.array([[u, v], [u + side, v], [u + side, v + side], [u, v + side]], dtype=np.float64)
 
     @property
     def marker_px(self) -> F64:
-        """Corners (4, 2) of the ArUco marker in panel pixels, clockwise from the top left."""
+        """The ArUco marker's corners in panel pixels, clockwise from the top left, as a (4, 2) array."""
         inset = QUIET * self.unit_px
         corners: F64 = self.saddles_px + inset * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
         return corners
@@ -69,7 +69,7 @@ class Mark:
 
 @lru_cache(maxsize=8)
 def marks(stack: PanelStack) -> tuple[Mark, ...]:
-    """Lay out the marks of all panels. Raises InputError if panels are too many or too small."""
+    """Lay out every panel's marks. Raises InputError if the panels are too small or there are too many."""
     if stack.count * PER_PANEL > DICTIONARY_SIZE:
         raise InputError("stack", "x_m", f"calibration boards support at most {DICTIONARY_SIZE // PER_PANEL} panels")
     unit = max(2, round(min(stack.width_px * 9 / 16, stack.height_px) / BITS_ON_SHORT_SIDE))
@@ -81,7 +81,7 @@ def marks(stack: PanelStack) -> tuple[Mark, ...]:
             "stack", "width_px", f"must be larger; boards need panels of {ACROSS * tile}x{DOWN * tile} pixels"
         )
     every = []
-    random = np.random.default_rng(16)  # fixed seed, because photographs are compared with the board
+    random = np.random.default_rng(16)  # fixed seed, so that photographs match the board
     for panel in range(stack.count):
         for place in range(PER_PANEL):
             corner = np.array([place % ACROSS, place // ACROSS]) * cell + 1 + random.uniform(size=2) * room
@@ -91,7 +91,7 @@ def marks(stack: PanelStack) -> tuple[Mark, ...]:
 
 
 def board(stack: PanelStack, panel: int) -> U8:
-    """Draw the board of one panel as an array (H, W) of the values 0 and 255."""
+    """Draw one panel's board as an (H, W) array of 0s and 255s."""
     picture = np.zeros((stack.height_px, stack.width_px), np.uint8)
     for mark in marks(stack):
         if mark.panel != panel:
@@ -108,5 +108,5 @@ def board(stack: PanelStack, panel: int) -> U8:
 
 
 def boards(stack: PanelStack) -> U8:
-    """Draw the boards of all panels as an array (N, H, W)."""
+    """Draw every panel's board, as an (N, H, W) array."""
     return np.stack([board(stack, index) for index in range(stack.count)])

@@ -1,8 +1,8 @@
-"""Estimate the pose of every panel by bundle adjustment, together with one camera's lens and poses.
+"""Estimate every panel's pose by bundle adjustment, together with one camera's lens and poses.
 
-The known pixel pitch of the panels sets the scale. The reference panel is fixed at its ideal pose and defines the
-stack's frame; every other panel has six degrees of freedom. A robust fit (soft L1) first identifies outliers, and
-ordinary least squares on the remaining points then gives an unbiased covariance.
+The panels' known pixel pitch sets the scale. The reference panel is fixed at its ideal pose and defines the stack's
+frame; every other panel has six degrees of freedom. A robust fit (soft L1) first identifies outliers, and ordinary
+least squares on the remaining points then gives an unbiased covariance.
 
 The derivatives are exact. The normal equations are small: about a hundred unknowns for thousands of coordinates.
 SciPy's `least_squares` gives the same covariance (to 1e-11) but takes 30 times as long, because it decomposes the
@@ -29,36 +29,37 @@ LENS = 9  # fx fy cx cy k1 k2 p1 p2 k3
 POSE = 6  # parameters of a pose: rotation vector, translation
 FOCAL_GUESSES = (0.6, 0.8, 1.1, 1.6, 2.4)  # initial focal lengths, relative to the photograph's longer side
 ROBUST_PX = 0.3  # scale of the soft L1 norm
-OUTLIER_SIGMAS = 4.0  # distance in standard deviations from which a point is an outlier
-MIN_SIGMA_PX = 0.01  # minimum noise assumed for the points, which keeps exact data free of outliers
-NO_FIT_PX = 5.0  # median distance from which the photographs do not show the configured stack
+OUTLIER_SIGMAS = 4.0  # distance, in standard deviations, beyond which a point is an outlier
+MIN_SIGMA_PX = 0.01  # minimum noise assumed for the points, so that exact data have no outliers
+NO_FIT_PX = 5.0  # median distance beyond which the photographs cannot be of the configured stack
 MAX_STEPS, MAX_DAMPING = 60, 1e8
-# Prior standard deviations that suit any camera: square pixels, a centred lens and a few percent of distortion. A
-# dozen photographs outweigh the priors by far.
+# Prior standard deviations that suit any camera: square pixels, a centred lens and a few percent of distortion. A dozen
+# photographs far outweigh the priors.
 SQUARE_SIGMA, CENTRE_SIGMA, DISTORTION_SIGMAS = 0.003, 0.03, (0.3, 0.5, 0.005, 0.005, 0.5)
 
 
 class Undetermined(ValueError):
-    """Raised when the photographs do not determine the poses of the panels. The message gives the reason."""
+    """Raised when the photographs do not determine the panels' poses. The message gives the reason."""
 
 
 @dataclass(frozen=True, slots=True)
 class Bundle:
-    """Result of a bundle adjustment: the poses of the panels and the camera, with the panels' covariance."""
+    """A bundle adjustment's result: the panels' poses and their covariance, and the camera's positions."""
 
-    panels: tuple[PlacedPanel, ...]  # rear to front; the pose of the reference panel is ideal
+    panels: tuple[PlacedPanel, ...]  # rear to front; the reference panel's pose is ideal
     reference: int  # index of the reference panel
     places_m: F64  # (P, 3) camera positions, frame `stack`
     covariance: F64  # (6(N-1), 6(N-1)): rotation about the centre (rad) and shift (m) of each non-reference panel
-    sigma_px: float  # standard deviation of one coordinate of a saddle point in a photograph
+    sigma_px: float  # standard deviation, per coordinate, of the saddle points in a photograph
     used: NDArray[np.bool_]  # (K,) True for points that are not outliers
     photograph: Any  # (K,) index of the photograph that shows each point
 
     def sigma_of(self, derived: Any) -> F64:
-        """Return the standard deviation of a quantity that is computed from the panels, to first order.
+        """Return the first-order standard deviation of a quantity computed from the panels.
 
         Args:
-            derived: Function from a sequence of panels to an array. The standard deviations have the same shape.
+            derived: Function that maps a sequence of panels to an array. The standard deviations have the array's
+                shape.
         """
         columns = []
         for number, step in enumerate(np.sqrt(np.diag(self.covariance)) * 0.1):
@@ -68,7 +69,7 @@ class Bundle:
         return np.asarray(np.sqrt(np.einsum("...i,ij,...j->...", slope, self.covariance, slope)), dtype=np.float64)
 
     def _stepped(self, number: int, step: float) -> tuple[PlacedPanel, ...]:
-        """Return the panels after a step of one parameter, numbered as in `covariance`."""
+        """Return the panels after changing parameter `number` by `step`, numbered as in `covariance`."""
         panels, change = list(self.panels), np.zeros(POSE)
         moving = [index for index in range(len(panels)) if index != self.reference][number // POSE]
         change[number % POSE] = step
@@ -82,13 +83,13 @@ class _State:
     """Current estimate of the lens, the panels' poses and the camera's poses."""
 
     lens: F64  # (9,) fx, fy, cx, cy, k1, k2, p1, p2, k3 as in OpenCV
-    turns: F64  # (N, 3, 3) rotations of the panels, stack_from_panel
-    middles_m: F64  # (N, 3) centres of the panels, frame `stack`
+    turns: F64  # (N, 3, 3) the panels' rotations, stack_from_panel
+    middles_m: F64  # (N, 3) the panels' centres, frame `stack`
     poses: F64  # (P, 4, 4) camera_from_stack for each photograph
 
     @property
     def camera(self) -> F64:
-        """Intrinsic matrix (3, 3) of the camera."""
+        """The camera's 3x3 intrinsic matrix."""
         fx, fy, cx, cy = self.lens[:4]
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
@@ -96,8 +97,8 @@ class _State:
 class _Problem:
     """Least-squares problem: the detected points, their residuals and the derivatives.
 
-    A step is a vector of changes: first the lens, then the poses of all panels except the reference, and last the poses
-    of the camera.
+    A step is a vector of changes: first to the lens, then to the poses of all panels except the reference, and last to
+    the camera's poses.
     """
 
     def __init__(self, seen: Sequence[SeenMarks], stack: PanelStack, *, reference: int) -> None:
@@ -116,31 +117,31 @@ class _Problem:
         self.prior_scale = 1 / np.array(sigmas)
 
     def stack_m(self, state: _State) -> F64:
-        """Return the positions (K, 3) of the saddle points in the frame `stack`."""
+        """Return the saddle points' positions in the `stack` frame, as a (K, 3) array."""
         turned = np.einsum("kij,kj->ki", state.turns[self.panel], self.local_m)
         return np.asarray(turned + state.middles_m[self.panel])
 
     def camera_m(self, state: _State) -> F64:
-        """Return the positions (K, 3) of the saddle points, each in the camera frame of its photograph."""
+        """Return the saddle points' positions, each in its photograph's camera frame, as a (K, 3) array."""
         poses = state.poses[self.photograph]
         return np.asarray(np.einsum("kij,kj->ki", poses[:, :3, :3], self.stack_m(state)) + poses[:, :3, 3])
 
     def residual_px(self, state: _State) -> F64:
-        """Return the projected minus the detected positions (K, 2) in pixels."""
+        """Return the projected positions minus the detected positions, in pixels, as a (K, 2) array."""
         seen = cv2.projectPoints(self.camera_m(state), np.zeros(3), np.zeros(3), state.camera, state.lens[4:])[0]
         return np.asarray(seen.reshape(-1, 2) - self.image_px, dtype=np.float64)
 
     def residuals(self, state: _State) -> F64:
-        """Return a vector (2K + priors,) of `residual_px` and the lens's deviations from its prior.
+        """Return a vector (2K + priors,) with `residual_px` and the lens's deviations from its prior.
 
-        The deviations from the prior are in standard deviations.
+        The deviations from the prior are given in standard deviations.
         """
         lens = state.lens
         prior = np.concatenate([[lens[0] - lens[1]], lens[2:4] - self.middle, lens[4:]]) * self.prior_scale
         return np.concatenate([self.residual_px(state).ravel(), prior])
 
     def slopes(self, state: _State) -> F64:
-        """Return the Jacobian (2K + priors, unknowns) of `residuals` with respect to a step."""
+        """Return the Jacobian of `residuals` with respect to a step, shape (2K + priors, unknowns)."""
         count = len(self.local_m)
         slopes = cv2.projectPoints(self.camera_m(state), np.zeros(3), np.zeros(3), state.camera, state.lens[4:])[1]
         by_point = slopes[:, 3:6].reshape(count, 2, 3) @ state.poses[self.photograph, :3, :3]
@@ -171,7 +172,7 @@ class _Problem:
         return _State(state.lens + step[:LENS], turns, middles_m, change @ state.poses)
 
     def start(self, *, reverse: bool = False) -> _State:
-        """Return the initial state: ideal panels, and the best of several focal lengths with its poses.
+        """Return the initial state: ideal panels, and the best of several focal lengths and its camera poses.
 
         Args:
             reverse: Assume that the panels are in reverse order.
@@ -203,7 +204,7 @@ def _solved(problem: _Problem, state: _State, used: NDArray[np.bool_], *, robust
         problem: Problem to solve.
         state: Initial state.
         used: Mask (K,) of the points to fit.
-        robust: Minimise the soft L1 norm by iterative reweighting instead of the sum of squares.
+        robust: Minimise the soft L1 norm, by iterative reweighting, rather than the sum of squares.
     """
     kept = np.concatenate([np.repeat(used, 2), np.ones(len(problem.prior_scale), bool)])
 
@@ -233,11 +234,11 @@ def _solved(problem: _Problem, state: _State, used: NDArray[np.bool_], *, robust
 
 
 def _refuse_reverse(problem: _Problem, state: _State) -> None:
-    """Raise Undetermined if the panels are in the reverse of the configured order.
+    """Raise Undetermined if the order of the panels is the reverse of the configured order.
 
-    The order is reversed if the configured order fits only with a camera behind the stack, or if it does not fit and
-    the reverse order does. (A camera behind the stack would take the same pictures as one in front of a stack that is
-    mirrored front to rear.)
+    The order counts as reversed if the configured order fits only with a camera behind the stack, or if it does not fit
+    but the reverse order does. (A camera behind the stack would take the same pictures as one in front of a stack that
+    is mirrored front to rear.)
     """
     depth_m = problem.camera_m(state)[:, 2]
     behind = any(np.median(depth_m[problem.photograph == number]) <= 0 for number in range(problem.photographs))
@@ -250,17 +251,17 @@ def _refuse_reverse(problem: _Problem, state: _State) -> None:
 
 
 def _median_px(problem: _Problem, state: _State) -> float:
-    """Return the median distance between projected and detected points in pixels."""
+    """Return the median distance between the projected and detected points, in pixels."""
     return float(np.median(np.linalg.norm(problem.residual_px(state), axis=1)))
 
 
 def adjust(seen: Sequence[SeenMarks], stack: PanelStack, *, reference: int) -> Bundle:
-    """Estimate the poses of all panels from photographs of the boards.
+    """Estimate every panel's pose from photographs of the boards.
 
     Args:
-        seen: Saddle points of each photograph. All photographs must have the same size and come from one camera.
-        stack: Configured geometry, from which the fit starts.
-        reference: Index of the panel that defines the frame `stack`.
+        seen: Saddle points found in each photograph. All photographs must have the same size and come from one camera.
+        stack: Configured geometry, used as the starting point of the fit.
+        reference: Index of the panel that defines the `stack` frame.
 
     Raises:
         Undetermined: The panels are in reverse order, or the photographs are too few or too similar.
@@ -298,7 +299,7 @@ def adjust(seen: Sequence[SeenMarks], stack: PanelStack, *, reference: int) -> B
 
 
 def _covariance(problem: _Problem, state: _State, used: NDArray[np.bool_], *, sigma: float) -> F64:
-    """Return the covariance of all unknowns if the points have the standard deviation `sigma` in pixels.
+    """Return the covariance of all unknowns, for points with a standard deviation of `sigma` pixels.
 
     Raises Undetermined if the photographs do not determine all unknowns.
     """

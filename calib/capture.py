@@ -1,6 +1,6 @@
-"""Guide a person through the calibration viewpoints and store a pair of points for each.
+"""Guide the user through the calibration viewpoints and store a pair of points for each.
 
-The command `phasestack calibrate capture` uses this module.
+Used by the `phasestack calibrate capture` command.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from runtime.records import F64, EyePoints
 from runtime.sensor.registry import open_sensor
 from runtime.sensor.samples import RecordedSamples
 
-WINDOW_NS = NS_PER_S // 2  # time over which the median of the samples is taken
-MAX_SPREAD_M = 0.010  # maximum motion or scatter of the eyes during this time
+WINDOW_NS = NS_PER_S // 2  # length of the window whose samples are combined by their median
+MAX_SPREAD_M = 0.010  # maximum motion or scatter of the eyes within the window
 MIN_SAMPLES = 5  # minimum number of samples for a meaningful spread
 
 
 def midpoint(eyes: EyePoints | None) -> F64 | None:
-    """Return the midpoint (3,) between the eyes, or None unless both eyes were measured with confidence."""
+    """Return the midpoint (3,) between the eyes, or None if either eye was not measured with confidence."""
     if eyes is None or eyes.completed or eyes.confidence.min() < CONFIDENCE_MIN:
         return None
     middle = eyes.eyes_m.mean(axis=0)
@@ -41,13 +41,13 @@ def midpoint(eyes: EyePoints | None) -> F64 | None:
 
 
 class EyeWindow:
-    """Midpoints of the eyes during the last half second, whose median gives a steady position."""
+    """Midpoints between the eyes from the last half second. Their median gives a steady position."""
 
     def __init__(self) -> None:
-        self._samples: deque[tuple[int, F64]] = deque()  # capture time and midpoint of the eyes
+        self._samples: deque[tuple[int, F64]] = deque()  # capture time and midpoint between the eyes
 
     def add(self, capture_ns: int, eyes: EyePoints | None) -> None:
-        """Add a sample in the sensor frame, and drop samples that are older than half a second.
+        """Add a sample in the sensor frame, and drop any that are more than half a second old.
 
         The midpoint is ignored unless both eyes were measured with confidence.
         """
@@ -60,8 +60,7 @@ class EyeWindow:
     def measure(self) -> tuple[F64, float] | None:
         """Return the median position (3,) in the sensor frame and the scatter around it, both in metres.
 
-        The scatter is a robust estimate of the RMS distance from the median. The result is None if there are too few
-        samples.
+        The scatter is a robust estimate of the RMS distance from the median. Returns None if there are too few samples.
         """
         if len(self._samples) < MIN_SAMPLES:
             return None
@@ -72,9 +71,9 @@ class EyeWindow:
 
 
 class Walk:
-    """Guide for a person who moves from viewpoint to viewpoint and accepts a pair of points at each.
+    """Guide for a user who moves from viewpoint to viewpoint and accepts a pair of points at each.
 
-    The caller delivers sensor samples and key presses. The class itself uses neither a clock nor threads.
+    The caller supplies the sensor samples and key presses. The class itself uses neither a clock nor threads.
     """
 
     def __init__(
@@ -88,10 +87,10 @@ class Walk:
         """Start with the first viewpoint that has no pair yet.
 
         Args:
-            file: File to which accepted pairs are written.
-            viewpoints: Viewpoints in the order of the visit.
-            say: Function that shows a line of text to the person.
-            chart: Function that shows the chart of a viewpoint, or None if the charts are shown in another way.
+            file: File that stores the accepted pairs.
+            viewpoints: Viewpoints, in the order they are to be visited.
+            say: Function that shows a line of text to the user.
+            chart: Function that shows a viewpoint's chart, or None if the charts are shown by other means.
         """
         self._file, self._say, self._chart = file, say, chart
         self._left = [v for v in viewpoints if v.name not in file.viewpoints]
@@ -103,7 +102,7 @@ class Walk:
 
     @property
     def current(self) -> Viewpoint:
-        """Viewpoint to which the person is currently asked to move."""
+        """Viewpoint that the user is currently asked to move to."""
         return self._left[self._index]
 
     def begin(self) -> None:
@@ -114,14 +113,14 @@ class Walk:
             self._announce()
 
     def see(self, capture_ns: int, eyes: EyePoints | None, serial: str) -> None:
-        """Add a sample in the sensor frame, with the serial number of the sensor."""
+        """Add a sample in the sensor frame, along with the sensor's serial number."""
         if self.finished:
             return
         self._serial = serial
         self._window.add(capture_ns, eyes)
 
     def press(self, key: Key | None) -> None:
-        """Accept a pair, change the viewpoint or stop, depending on the key. None has no effect."""
+        """Accept a pair, change the viewpoint or stop, depending on the key. Does nothing if it is None."""
         if self.finished:
             return
         match key:
@@ -135,7 +134,7 @@ class Walk:
                 self._go(-1)
 
     def summary(self) -> dict[str, Any]:
-        """Return the counts of pairs and the skipped viewpoints for the summary of the command."""
+        """Return the pair counts and the skipped viewpoints, for the command to report."""
         names = self._file.viewpoints
         return {
             "file": str(self._file.path),
@@ -168,7 +167,7 @@ class Walk:
         index = min(max(self._index + step, 0), len(self._left) - 1)
         if index != self._index:
             self._index = index
-            self._window = EyeWindow()  # drops the samples of the previous viewpoint
+            self._window = EyeWindow()  # drops the previous viewpoint's samples
             self._announce()
 
     def _announce(self) -> None:
@@ -186,17 +185,17 @@ class Walk:
 def capture_live(
     out: Path, settings: Settings, hardware: SetupHardware, *, show: bool, say: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Guide a person in front of the display through the viewpoints.
+    """Guide the user through the viewpoints in front of the display.
 
     Args:
-        out: CSV file of the pairs. An existing file is continued.
-        settings: Configuration of the display and the sensor.
+        out: CSV file for the pairs. If it exists, pairs are added to it.
+        settings: Display and sensor configuration.
         hardware: Real or simulated hardware.
         show: Show the charts on the panels.
-        say: Function that shows a line of text to the person.
+        say: Function that shows a line of text to the user.
 
     Returns:
-        The summary of the command.
+        A summary of the run, for the command to report.
 
     Raises:
         InputError: The file is invalid or cannot be written, or the sensor or the panels cannot be opened.
@@ -221,15 +220,15 @@ def capture_live(
 
 
 def capture_recording(out: Path, settings: Settings, *, source: str) -> dict[str, Any]:
-    """Write a pair for every sample of a recording that contains the true eye positions.
+    """Write a pair for every sample in a recording that includes the true eye positions.
 
     Args:
-        out: CSV file of the pairs. An existing file is continued.
-        settings: Configuration of the sensor.
+        out: CSV file for the pairs. If it exists, pairs are added to it.
+        settings: Sensor configuration.
         source: Path of the recording, or `demo` for the built-in recording.
 
     Returns:
-        The summary of the command.
+        A summary of the run, for the command to report.
 
     Raises:
         InputError: No sample has both the true eye positions and confidently measured eyes.

@@ -1,7 +1,7 @@
 """Draw calibration charts with black lines at the thirds of each eye's image (EyeReal, 2.3, S4).
 
-The layers of a chart show both eyes the same lines. The lines fuse into clean single lines for a person whose eyes are
-at the viewpoint of the chart. From any other position they show ghosts and stripes.
+A chart's layers show both eyes the same lines. For a person whose eyes are at the chart's viewpoint, the lines fuse
+into clean single lines. From any other position, ghosts and stripes are visible.
 """
 
 from __future__ import annotations
@@ -23,34 +23,34 @@ from runtime.support.artifacts import OutputFolder, write_json, write_png
 from runtime.support.progress import tracked
 
 MODEL = "best"
-LINE_PX = 10.0  # width of a line in pixels of the eye's image
+LINE_PX = 10.0  # line width, in pixels of the eye's image
 WIDEST_FOV_DEG = 40.0  # horizontal field of view of the eyes' images, as in the published code
 
 
 def chart_fov_deg(viewpoint: Viewpoint, stack: PanelStack) -> float:
     """Return the horizontal field of view of the eyes' images at a viewpoint, in degrees.
 
-    This is the published 40 degrees, or the angle that the display fills if it is smaller. The lines are therefore on
-    the panels at any distance.
+    This is the published 40 degrees, or the angle that the display fills if that is smaller, so the lines are on the
+    panels at any distance.
     """
     return min(WIDEST_FOV_DEG, float(np.degrees(2 * np.arctan(stack.width_m / 2 / (viewpoint.radius_cm / 100)))))
 
 
 def line_picture(*, width_px: int, height_px: int) -> U8:
-    """Draw the picture (h, w, 3) for one eye, with lines at the thirds of the width and the height."""
+    """Draw one eye's picture (h, w, 3), with lines at the thirds of its width and height."""
     ink = np.maximum(_ink(width_px), _ink(height_px)[:, None])
     return np.repeat(np.rint(255 * (1 - ink)).astype(np.uint8)[..., None], 3, axis=2)
 
 
 def _ink(length_px: int) -> F64:
-    """Return the share (length,) of each pixel that two lines at the thirds of the length cover."""
+    """Return the share (length,) of each pixel that is covered by two lines at the thirds of the length."""
     position = np.arange(length_px, dtype=np.float64) + 0.5
     distance = np.minimum(np.abs(position - length_px / 3), np.abs(position - 2 * length_px / 3))
     return np.clip(LINE_PX / 2 - distance + 0.5, 0.0, 1.0)
 
 
 class Charts:
-    """Solver for the layers of the charts of one stack."""
+    """Solver that computes the layers of one stack's charts."""
 
     def __init__(self, settings: Settings) -> None:
         """Load the model that computes the layers.
@@ -76,15 +76,15 @@ class Charts:
 
 
 def make_charts(out: Path, viewpoints: Sequence[Viewpoint], settings: Settings) -> dict[str, Any]:
-    """Write the layers of all charts as PNG files, together with `charts.json`.
+    """Write every chart's layers as PNG files, together with `charts.json`.
 
     Args:
         out: Folder to write to.
         viewpoints: Viewpoints that need a chart.
-        settings: Configuration of the display and the model.
+        settings: Display and model configuration.
 
     Returns:
-        The summary of the command.
+        A summary of the run, for the command to report.
 
     Raises:
         InputError: A file cannot be written, or the model cannot be loaded for this stack.

@@ -1,6 +1,6 @@
 """Check calibration pairs and solutions.
 
-Unusable data raise InputError, and doubtful data cause warnings.
+If the data are unusable, InputError is raised; if they are doubtful, warnings are returned.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from runtime.eyes.calibration import check_similarity
 from runtime.records import F64
 
 RESIDUAL_LIMIT_M = 0.05  # as in the EyeReal supplement (figure S5)
-SENSOR_NOISE_FLOOR_M = 0.001  # least noise assumed, because no depth camera measures a face more accurately
+SENSOR_NOISE_FLOOR_M = 0.001  # minimum noise assumed, because no depth camera measures a face more accurately
 REFUSE_EYE_ERROR_M = 0.05  # expected error at the eye above which a calibration is useless
 WARN_EYE_ERROR_M = 0.01  # expected error at the eye above which ghosts are visible
 COPLANAR = 0.01  # ratio of the smallest to the largest extent up to which points count as coplanar
-MIRROR_GAIN = 0.5  # data count as mirrored if mirroring the sensor's points reduces the error to this share
+MIRROR_GAIN = 0.5  # data count as mirrored if mirroring the sensor's points reduces the error below this share
 NAMED = 8  # maximum number of pairs named in a message
 
 
 def check_pairs(pairs: Pairs) -> list[str]:
-    """Return warnings about pairs, before a calibration is computed.
+    """Check pairs before they are used to compute a calibration, and return warnings.
 
     Raises:
-        InputError: There are fewer than 3 pairs, the points are coincident or collinear, double precision does not
-            suffice for the points, an axis is mirrored, or one side is in millimetres.
+        InputError: There are fewer than 3 pairs, the points are coincident or collinear, double precision is
+            insufficient for them, an axis is mirrored, or the points in one frame are in millimetres.
     """
     if _is_mirrored(pairs):
         raise InputError(
@@ -53,12 +53,12 @@ def check_pairs(pairs: Pairs) -> list[str]:
 
 
 def check_solution(pairs: Pairs, solution: CalibrationSolution, volume_m: F64) -> list[str]:
-    """Return warnings about a solution.
+    """Check a solution and return warnings.
 
     Args:
-        pairs: Pairs from which the calibration was computed.
+        pairs: Pairs used to compute the calibration.
         solution: Calibration to check.
-        volume_m: Points (..., 3) in the frame `stack` that span the space in which viewers move.
+        volume_m: Points (..., 3) in the `stack` frame that span the viewers' range of movement.
 
     Raises:
         InputError: The matrix is implausible, or the residuals or the expected error at the eye are too large.

@@ -1,4 +1,4 @@
-"""Commands of `phasestack calibrate`, which measure panels, grey curves and the sensor's pose."""
+"""Commands under `phasestack calibrate` that measure panels, grey curves and the sensor's pose."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ def panels(
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure the pose of every panel, with standard errors, from photographs of coded boards.
+    """Measure every panel's pose, with standard errors, from photographs of coded boards.
 
-    First show the boards with --show. In a dim room, take 8 to 20 hand-held photographs in which the display fills most
-    of the picture, all with the same camera and zoom. Take them from the middle, left, right, above and below, up to 40
-    degrees off the axis, and a few in portrait. Then pass their folder as --photos.
+    First show the boards with --show. In a dim room, take 8 to 20 hand-held photographs, all with the same camera and
+    zoom and with the display filling most of the picture. Take them from the middle, left, right, above and below, up
+    to 40 degrees off the axis, and a few in portrait. Then pass their folder as --photos.
 
     Example: phasestack calibrate panels --photos photos --config phasestack.toml --write --out registration
     """
@@ -104,7 +104,7 @@ def charts(
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Draw the calibration charts. The lines of a chart fuse only for eyes at its viewpoint.
+    """Draw the calibration charts. A chart's lines fuse only for eyes at its viewpoint.
 
     Example: phasestack calibrate charts --out charts
     """
@@ -125,10 +125,10 @@ def capture(
     show: Annotated[bool, typer.Option("--show", help="show the charts on the panels")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Pair the viewpoint of each chart with the measured eyes, and save every accepted pair immediately.
+    """Pair each chart's viewpoint with the measured eyes, and save every accepted pair immediately.
 
-    With a live sensor, move until the lines of the chart fuse, then press Enter. Press n for the next chart, p to go
-    back and replace a pair, or q to stop. A recording must contain true eye positions, as the demo does.
+    With a live sensor, move until the chart's lines fuse, then press Enter. Press n for the next chart, p to go back
+    and replace a pair, or q to stop. A recording must contain true eye positions, as the demo does.
 
     Example: phasestack calibrate capture --config /etc/phasestack/phasestack.toml --show --out pairs.csv
     """
@@ -177,7 +177,7 @@ def report(
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write a page with the figures and error plots of a calibration.
+    """Write a page with a calibration's figures and error plots.
 
     Example: phasestack calibrate report calibration.toml --out report
     """
@@ -194,7 +194,7 @@ def _settings(config: Path | None) -> Settings:
 
 
 def _report(summary: dict[str, Any], as_json: bool) -> None:
-    """Print the summary of a command as one JSON object or as one line per field."""
+    """Print a command's summary as one JSON object or as one line per field."""
     from runtime.support.artifacts import to_json
     from runtime.support.figures import shown
 

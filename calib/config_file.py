@@ -25,9 +25,9 @@ KEPT_BYTES_MAX = 64 << 20  # size limit for a file that is backed up
 
 
 def save(path: Path, text: str) -> Path | None:
-    """Write a file atomically and keep the version that it replaces under a numbered name.
+    """Write a file atomically and keep the version it replaces under a numbered name.
 
-    A symbolic link is kept, and the file to which it points is written.
+    If the path is a symbolic link, the link is kept and its target is written.
 
     Returns:
         The path of the old version, which has the same permissions as the file, or None if the file is new.
@@ -86,20 +86,20 @@ def rewrite(config: Path, change: Callable[[TOMLDocument], None]) -> Path | None
 
 
 def put(document: TOMLDocument, section: str, values: Mapping[str, Any]) -> None:
-    """Set keys of a table. The table is created if the document has no such section."""
+    """Set keys in a section's table. The table is created if the document has no such section."""
     table: Any = document.setdefault(section, tomlkit.table())
     for key, value in values.items():
         table[key] = value
 
 
 def put_panels(document: TOMLDocument, key: str, values: Mapping[int, Any], *, panels: int) -> None:
-    """Set a key, such as `lut`, in the tables `[[output.panels]]`. Missing tables are created.
+    """Set a key, such as `lut`, in the `[[output.panels]]` tables. Missing tables are created.
 
     Args:
         document: Configuration to modify.
         key: Key to set.
-        values: Value of the key by the index of the panel. Other panels keep their values.
-        panels: Number of panels of the stack.
+        values: The key's values, keyed by panel index. Other panels keep their values.
+        panels: Number of panels in the stack.
     """
     output: Any = document.setdefault("output", tomlkit.table())
     if "panels" not in output:
@@ -111,7 +111,7 @@ def put_panels(document: TOMLDocument, key: str, values: Mapping[int, Any], *, p
 
 
 def put_monitors(document: TOMLDocument, tables: Sequence[Mapping[str, Any]]) -> None:
-    """Set the monitor and the mounting of every panel.
+    """Set every panel's monitor and mounting.
 
     A panel whose monitor and mounting have not changed keeps its registration and its grey curve.
 

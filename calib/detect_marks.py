@@ -12,20 +12,20 @@ from calib.board import MARKER, Mark, dictionary, marks
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
 
-DETECTION_PX = 2400  # size of the photograph's copy in which marks are searched; corners are located in the original
-MIN_MARKS = 3  # minimum number of marks per panel, which is twelve points
-MIN_EXTENT = 0.3  # share of a panel that its marks must span, because marks in one corner hardly determine the panel
-MIN_UNIT_PX = 1.7  # minimum size of a marker's bit in the photograph
-BLURRED_BITS = 1.1  # maximum width of an edge, in bits of a marker
-MIN_CONTRAST = 0.35  # minimum contrast at a saddle point, relative to the contrast of the mark
+DETECTION_PX = 2400  # size of the copy searched for marks; corners are located in the original photograph
+MIN_MARKS = 3  # minimum number of marks per panel (twelve points)
+MIN_EXTENT = 0.3  # share of a panel that its marks must span, because marks in one corner barely determine the panel
+MIN_UNIT_PX = 1.7  # minimum size of a marker bit in the photograph
+BLURRED_BITS = 1.1  # maximum width of an edge, in marker bits
+MIN_CONTRAST = 0.35  # minimum contrast at a saddle point, relative to the mark's contrast
 MIN_DYNAMIC = 24  # minimum difference between black and white in 8-bit levels
 
 
 @dataclass(frozen=True, slots=True)
 class SeenMarks:
-    """Saddle points that were found in one photograph."""
+    """Saddle points found in one photograph."""
 
-    name: str  # file name of the photograph
+    name: str  # the photograph's file name
     width_px: int
     height_px: int
     panel: Any  # (K,) index of the panel that shows each point
@@ -46,7 +46,7 @@ def _detector() -> Any:
 
 
 def _markers(picture: U8, known: dict[int, Mark]) -> list[tuple[Mark, F64]]:
-    """Return the marks that can be read in a picture and the corners (4, 2) of their markers in pixels.
+    """Return the marks that can be read in a picture, each with its marker's corners (4, 2) in pixels.
 
     Markers that appear more than once are dropped. `known` maps the ids of all markers to their marks.
     """
@@ -100,7 +100,7 @@ def find_marks(picture: U8, stack: PanelStack, *, name: str) -> SeenMarks:
 
 
 def _mirrored(picture: U8, known: dict[int, Mark], counts: list[int]) -> str:
-    """Return a message if marks can be read only in the mirror image of a picture, otherwise "".
+    """Return a message if marks can be read only in a picture's mirror image, otherwise "".
 
     `counts` is the number of marks found on each panel.
     """
@@ -120,7 +120,7 @@ def _unreadable(counts: list[int], edges: list[float], unit_px: float) -> str:
 
     Args:
         counts: Number of marks found on each panel.
-        edges: Width of the edges of each mark, in marker bits.
+        edges: Edge width of each mark, in marker bits.
         unit_px: Size of a marker bit in the photograph.
     """
     if sum(counts) == 0:
@@ -134,11 +134,11 @@ def _unreadable(counts: list[int], edges: list[float], unit_px: float) -> str:
 
 
 def _covered(counts: list[int], places: F64, owners: Any) -> str:
-    """Return a message if the marks of a panel are too few or too close together to locate the panel.
+    """Return a message if a panel's marks are too few or too close together to locate the panel.
 
     Args:
         counts: Number of marks found on each panel.
-        places: Saddle points (K, 2) relative to the width and the height of their panel.
+        places: Saddle points (K, 2), as fractions of their panel's width and height.
         owners: Index (K,) of the panel that shows each saddle point.
 
     Returns:
@@ -156,23 +156,23 @@ def _covered(counts: list[int], places: F64, owners: Any) -> str:
 
 
 def _unit_px(quad: F64) -> float:
-    """Return the size of a marker's bit in the photograph, along the shortest side of the marker."""
+    """Return the size of a marker bit in the photograph, along the marker's shortest side."""
     sides = np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1)
     return float(sides.min()) / MARKER
 
 
 def _refined(picture: U8, guess: F64, quad: F64, *, window: int) -> tuple[Any, F64]:
-    """Locate the four saddle points of a mark and check their contrast.
+    """Locate a mark's four saddle points and check their contrast.
 
     Args:
         picture: Grey photograph (h, w).
-        guess: Approximate positions (4, 2) of the saddle points.
-        quad: Corners (4, 2) of the marker in the photograph.
-        window: Half the side of the search window in pixels.
+        guess: The saddle points' approximate positions (4, 2).
+        quad: The marker's corners (4, 2) in the photograph.
+        window: Half the search window's side length, in pixels.
 
     Returns:
-        A mask (4,) of the points that are white along the diagonal of the mark and black across it, and the refined
-        positions (4, 2).
+        A mask (4,) that is True for points that are white along the mark's diagonal and black across it, and the
+        refined positions (4, 2).
     """
     height, width = picture.shape
     inside = (
@@ -186,7 +186,7 @@ def _refined(picture: U8, guess: F64, quad: F64, *, window: int) -> tuple[Any, F
     cv2.cornerSubPix(picture, points, (window, window), (-1, -1), criteria)
     refined = points.reshape(-1, 2).astype(np.float64)
     near = np.linalg.norm(refined - guess, axis=1) < 0.8 * window
-    # Offsets of about one bit along and across the diagonals of the mark.
+    # Offsets of about one bit along and across the mark's diagonals.
     out = (guess - guess.mean(axis=0)) / 5 * 0.9
     arms = np.stack([refined + out, refined - out, refined + _quarter(out, guess), refined - _quarter(out, guess)])
     values = _samples(picture, arms)
@@ -197,9 +197,9 @@ def _refined(picture: U8, guess: F64, quad: F64, *, window: int) -> tuple[Any, F
 
 
 def _quarter(out: F64, guess: F64) -> F64:
-    """Return an offset (4, 2) across the diagonal at each corner, about as long as the offsets `out`.
+    """Return offsets (4, 2) across the diagonal at each corner, about as long as the offsets `out`.
 
-    The offset is parallel to the line between the neighbouring corners, which allows for perspective.
+    Each offset is parallel to the line between the neighbouring corners, which allows for perspective.
     """
     following, before = np.roll(guess, -1, axis=0) - guess, np.roll(guess, 1, axis=0) - guess
     return np.asarray((following - before) / 10 * 0.9, dtype=np.float64)
@@ -215,7 +215,8 @@ def _samples(picture: U8, points: F64) -> F64:
 def _edge_px(picture: U8, quad: F64) -> float:
     """Return the width of a marker's outer edge in pixels, as a measure of blur.
 
-    The width is the contrast divided by the steepest slope across the edge. It is the median over the four sides.
+    Each side's width is its contrast divided by the steepest slope across the edge; the result is the median of the
+    four sides.
     """
     widths = []
     centre = quad.mean(axis=0)

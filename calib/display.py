@@ -1,4 +1,4 @@
-"""Show layers on the panels during the setup, and read the keys that are pressed in their windows."""
+"""Show layers on the panels during setup, and read keys pressed in their windows."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ class PanelDisplay:
     def key(self) -> Key | None:
         """Return the next key that was pressed, or None.
 
-        The layers are presented again, which keeps the windows responsive. Raises PanelLost if a panel is lost.
+        The layers are presented again to keep the windows responsive. Raises PanelLost if a panel is lost.
         """
         if self._layers is not None:
             self.show(self._layers)
         return self._keys.poll()
 
     def close(self) -> None:
-        """Close the windows of the panels. Further calls have no effect."""
+        """Close the panels' windows. Further calls have no effect."""
         self._sink.close()
 
 
@@ -50,9 +50,9 @@ def open_display(settings: Settings, *, registered: bool = False, grey_curve: bo
     """Open the configured panels.
 
     Args:
-        settings: Configuration of the display.
-        registered: Apply the registration, that is, the homography of each panel.
-        grey_curve: Apply the gamma or the LUT of each panel.
+        settings: Display configuration.
+        registered: Apply the registration, that is, each panel's homography.
+        grey_curve: Apply each panel's gamma or LUT.
 
     Raises:
         InputError: The settings are not suitable for this machine.

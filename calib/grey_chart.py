@@ -1,11 +1,13 @@
-"""Measure a panel's grey curve from photographs of a chart, with a camera of unknown tone curve.
+"""Measure a panel's grey curve from photographs of a chart; the camera's tone curve may be unknown.
 
-The patches of each grey are scattered over the chart, which makes it possible to separate uneven light from the greys.
-Other patches mix black and white pixels in known proportions. Their intensity does not depend on the panel's grey
-curve, so they calibrate the camera. Marks of the calibration board between the patches locate them in a photograph.
+The patches of each grey are scattered over the chart so that uneven illumination can be separated from the greys. Other
+patches mix black and white pixels in known proportions. Their intensity does not depend on the panel's grey curve, so
+they are used to calibrate the camera. Marks from the calibration board, placed between the patches, are used to locate
+the patches in a photograph.
 
 If the other panels are at zero, a panel with phase p between crossed polarizers shows dark + range·sin²(pi/2·p)
-(EyeReal, (4)). Full white is assumed to be phase 1. Photographs cannot reveal that a panel does not reach this phase.
+(EyeReal, (4)). Full white is assumed to be phase 1. Photographs cannot show whether a panel actually reaches this
+phase.
 """
 
 from __future__ import annotations
@@ -31,11 +33,11 @@ from runtime.support.artifacts import write_text
 
 GREYS = tuple(round(255 * step / 12) for step in range(13))
 SHARES = tuple(step / 16 for step in (1, 2, 4, 6, 8, 11, 14))  # shares of white pixels in the mixed patches
-PATCHES_ACROSS = 32  # number of patches across the width of a panel
+PATCHES_ACROSS = 32  # number of patches across a panel's width
 MARGIN = 0.15  # share of a panel left free at each edge, because the edges look dark from nearby
 INNER = 0.5  # share of a patch's side that is measured
 SAMPLES = 24  # number of samples along each side of a patch
-MIN_MARKS = 4  # minimum number of marks for the homography from the panel to a photograph
+MIN_MARKS = 4  # minimum number of marks needed to fit the homography from panel to photograph
 FALLS = 0.01  # maximum decrease in intensity from a grey to the next brighter one, as a share of the full range
 CLIPPED = 0.02  # share of clipped pixels in white patches above which a photograph is overexposed
 LUT_ROWS = 256  # one row for each 8-bit phase
@@ -44,7 +46,7 @@ BAYER = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]])
 
 @dataclass(frozen=True, slots=True)
 class Patch:
-    """Square of the chart that has one grey or mixes black and white pixels."""
+    """A square on the chart, either of one grey or with a mixture of black and white pixels."""
 
     left_px: int
     top_px: int
@@ -55,12 +57,12 @@ class Patch:
 
 @lru_cache(maxsize=8)
 def patches(stack: PanelStack, panel: int) -> tuple[Patch, ...]:
-    """Lay out the patches of a panel's chart between the marks of its board.
+    """Lay out the patches of a panel's chart between its board's marks.
 
-    The greys and mixtures are in random order, which is always the same for a panel.
+    The greys and mixtures are in a random order that is always the same for a given panel.
     """
     pitch = stack.width_px // PATCHES_ACROSS
-    side = pitch * 5 // 6 // 8 * 8  # the measured half then contains whole periods of the mixing pattern
+    side = pitch * 5 // 6 // 8 * 8  # so that the measured half contains whole periods of the mixing pattern
     free = [
         (left, top)
         for top in range(round(MARGIN * stack.height_px), round((1 - MARGIN) * stack.height_px) - side, pitch)
@@ -88,9 +90,9 @@ def _is_covered(stack: PanelStack, panel: int, left: int, top: int, side: int) -
 
 
 def grey_chart(stack: PanelStack, panel: int) -> U8:
-    """Draw the chart of a panel as an array (H, W).
+    """Draw a panel's chart as an (H, W) array.
 
-    The chart must be shown without resampling or LUT, while all other panels are at zero.
+    The chart must be shown without resampling and without a LUT, while all other panels are at zero.
     """
     picture = board(stack, panel)
     for patch in patches(stack, panel):
@@ -113,17 +115,17 @@ def grey_charts(stack: PanelStack, panel: int) -> U8:
 def lut_from_photographs(
     out: Path, pictures: Iterable[tuple[str, U8]], stack: PanelStack, *, panel: int, source: str
 ) -> dict[str, Any]:
-    """Measure the grey curve of a panel from photographs of its chart, and write the LUT.
+    """Measure a panel's grey curve from photographs of its chart, and write the LUT.
 
     Args:
         out: CSV file to write the LUT to.
-        pictures: Names and grey pixels (h, w) of the photographs.
-        stack: Geometry of the panels.
-        panel: Index of the panel.
-        source: Origin of the photographs, for error messages.
+        pictures: The photographs' names and grey pixels (h, w).
+        stack: Panel geometry.
+        panel: Panel index.
+        source: Origin of the photographs, used in error messages.
 
     Returns:
-        The summary of the command.
+        A summary of the run, for the command to report.
 
     Raises:
         InputError: A photograph is unusable, or the measured greys do not increase.
@@ -135,7 +137,7 @@ def lut_from_photographs(
 
 
 def write_lut(out: Path, intensity: F64) -> None:
-    """Write a LUT with 256 rows of phase and grey from 0 to 1, given the intensities (13,) of `GREYS`."""
+    """Write a LUT with 256 rows of phase and grey (0 to 1), given the intensities (13,) of `GREYS`."""
     # The square root of the intensity is smooth at both ends, for bare panels and for monitors with a tone curve.
     root = PchipInterpolator(np.array(GREYS) / 255, np.sqrt(np.maximum.accumulate(intensity)))
     fine, rows = np.linspace(0.0, 1.0, 4097), np.linspace(0.0, 1.0, LUT_ROWS)
@@ -145,13 +147,13 @@ def write_lut(out: Path, intensity: F64) -> None:
 
 
 def histograms(picture: U8, stack: PanelStack, panel: int, *, source: str) -> F64:
-    """Return the histograms (P, 256) of the pixel values in the middle of each patch.
+    """Return a histogram of the pixel values in the middle of each patch, as a (P, 256) array.
 
     Args:
         picture: Grey photograph (h, w) of a chart.
-        stack: Geometry of the panels.
+        stack: Panel geometry.
         panel: Index of the panel that shows the chart.
-        source: Name of the photograph, for error messages.
+        source: Name of the photograph, used in error messages.
 
     Raises:
         InputError: The photograph is too dark or overexposed, or does not show the entire chart.
@@ -184,19 +186,20 @@ def histograms(picture: U8, stack: PanelStack, panel: int, *, source: str) -> F6
 
 
 def measure(pictures: list[F64], stack: PanelStack, panel: int, *, source: str) -> tuple[F64, float]:
-    """Estimate the intensities of `GREYS` from the histograms of photographs with equal exposure.
+    """Estimate the intensities of `GREYS` from histograms of photographs taken at the same exposure.
 
-    The fit determines the camera's tone curve, the uneven light in each photograph (a quadratic polynomial in the
-    logarithm of the light) and the intensities of the greys.
+    The fit determines the camera's tone curve, the uneven illumination in each photograph (its logarithm is modelled as
+    a quadratic polynomial in position) and the intensities of the greys.
 
     Args:
-        pictures: Histograms (P, 256) of the patches in each photograph.
-        stack: Geometry of the panels.
+        pictures: Each photograph's patch histograms (P, 256).
+        stack: Panel geometry.
         panel: Index of the panel that shows the chart.
-        source: Origin of the photographs, for error messages.
+        source: Origin of the photographs, used in error messages.
 
     Returns:
-        The intensities (13,) from 0 to 1, and the median residual relative to the intensity of a patch.
+        The intensities (13,) from 0 to 1, and the median of the absolute residuals, each divided by its patch's
+        intensity (plus 0.02).
 
     Raises:
         InputError: The intensities do not increase from grey to grey.

@@ -1,4 +1,4 @@
-"""Access to the hardware that the setup uses: keys, monitors, panels, photographs and a depth sensor."""
+"""Access to the hardware used during setup: keys, monitors, panels, photographs and a depth sensor."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ Say = Callable[[str], None]
 Named = tuple[str, U8]  # name and pixels (h, w) of a photograph
 Sample = tuple[int, EyePoints | None, str]  # capture time in ns, eyes in the sensor frame, the sensor's serial number
 POLL_NS = 20 * NS_PER_MS  # interval between polls for keys and samples
-CARD_CHARACTERS = 32  # maximum number of characters in a line of an identity card
+CARD_CHARACTERS = 32  # maximum number of characters per line on an identity card
 
 
 class SetupHardware:
     """Access to real hardware: monitors on X11, a sensor, a folder of photographs and the keyboard.
 
-    The object opens at most one set of windows and one sensor at a time, and `close` releases everything.
+    At most one set of windows and one sensor are open at a time, and `close` releases everything.
     """
 
     simulated = False
@@ -42,8 +42,9 @@ class SetupHardware:
         """Store the arguments without opening any device.
 
         Args:
-            keys: Function that returns the next key from the terminal. Keys from the panels' windows are added.
-            photos: Folder into which the person puts the photographs.
+            keys: Function that returns the next key pressed in the terminal. Keys pressed in the panels' windows are
+                read as well.
+            photos: Folder where the user puts the photographs.
         """
         self._keys, self._photos = keys, photos
         self._clock = MonotonicClock()
@@ -54,20 +55,20 @@ class SetupHardware:
         self._frames: list[SensorFrame] = []  # received, but not yet returned by `sample`
 
     def poll(self) -> Key | None:
-        """Return the next key that was pressed in the terminal or in a panel's window, or None.
+        """Return the next key pressed in the terminal or in a panel's window, or None.
 
-        The call also keeps the windows responsive.
+        Calling this also keeps the windows responsive.
         """
         return self._keys() or (self._display.key() if self._display is not None else None)
 
     def key(self) -> Key:
-        """Wait until a key is pressed, and return the key."""
+        """Wait for a key press and return the key."""
         while (key := self.poll()) is None:
             self.wait()
         return key
 
     def wait(self) -> None:
-        """Sleep until keys and samples should be polled again."""
+        """Sleep until it is time to poll for keys and samples again."""
         self._clock.sleep_until_ns(self._clock.now_ns() + POLL_NS)
 
     def monitors(self) -> tuple[Monitor, ...]:
@@ -87,8 +88,8 @@ class SetupHardware:
         """Show a card with lines of text on one monitor, and clear the other monitors.
 
         Args:
-            number: Index of the monitor in the result of `monitors`.
-            words: Texts to show. Long texts are wrapped.
+            number: Index of the monitor in the tuple returned by `monitors`.
+            words: Lines of text to show. Long lines are wrapped.
         """
         cards, monitors = self._cards
         height, width = cards[number].shape[:2]
@@ -98,16 +99,17 @@ class SetupHardware:
             self._display.show(alone([*cards[:number], card, *cards[number + 1 :]], number))
 
     def photographs(self, settings: Settings, pictures: U8, *, panel: int | None, say: Say) -> Iterator[Named]:
-        """Show pictures on the panels without registration, wait for a person's photographs and return them.
+        """Show pictures on the panels without registration, wait for the user's photographs and return them.
 
         Args:
-            settings: Configuration of the display.
-            pictures: One grey picture per panel (N, H, W): the boards, or the grey chart of one panel.
-            panel: Index of the panel with the grey chart, which is shown without a grey curve. None means the boards.
-            say: Function that shows a line of text to the person.
+            settings: Display configuration.
+            pictures: One grey picture per panel (N, H, W): the boards, or one panel's grey chart.
+            panel: Index of the panel that shows the grey chart, with no grey curve applied, or None if the boards are
+                shown.
+            say: Function that shows a line of text to the user.
 
         Raises:
-            InputError: The person stopped, or the folder has no readable photographs.
+            InputError: The user stopped, or the folder has no readable photographs.
             PanelLost: A panel was lost.
         """
         self.let_go()
@@ -128,8 +130,8 @@ class SetupHardware:
         """Start the sensor, wait until it works, and return its name and serial number.
 
         Raises:
-            InputError: The driver is unknown, the sensor does not work in time, or it needs no calibration because it
-                delivers eyes in the stack frame.
+            InputError: The driver is unknown, the sensor does not start working in time, or it needs no calibration
+                because it delivers eyes in the stack frame.
         """
         self._stop_sensor()
         open_sensor(settings.sensor, self._clock)  # refuses unknown names before anything starts
@@ -156,10 +158,10 @@ class SetupHardware:
         return f"{settings.sensor.driver} {worker.serial}".strip()
 
     def sample(self, standing_at: Viewpoint) -> Sample | None:
-        """Return the next sample of the sensor, or None if no sample has arrived.
+        """Return the sensor's next sample, or None if no sample has arrived.
 
-        Samples are queued, and none is lost if the panels are slow. `standing_at` is the viewpoint to which the person
-        was asked to move; only the simulation uses it.
+        Samples are queued, so slow panels do not cause any to be lost. `standing_at` is the viewpoint that the user was
+        asked to move to; only the simulation uses it.
         """
         if self._worker is None:
             return None
@@ -173,7 +175,7 @@ class SetupHardware:
         return frame.capture_ns, frame.eyes, self._worker.serial
 
     def chart(self, settings: Settings) -> Callable[[Viewpoint], None] | None:
-        """Return a function that shows the chart of a viewpoint, or None if charts cannot be shown."""
+        """Return a function that shows a viewpoint's chart, or None if charts cannot be shown."""
         self.let_go()
         charts, display = Charts(settings), open_display(settings, registered=True)
         self._charts, self._display = charts, display
@@ -185,7 +187,7 @@ class SetupHardware:
         self._stop_sensor()
 
     def let_go(self) -> None:
-        """Close the windows, and the model that computes the layers of the charts."""
+        """Close the windows and the model that computes the charts' layers."""
         for part in (self._display, self._charts):
             if part is not None:
                 part.close()

@@ -1,4 +1,4 @@
-"""Read lines and single keys from the terminal, and single keys from the windows of the panels."""
+"""Read lines and single keys from the terminal, and single keys from the panels' windows."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from runtime.panels.base import PanelSink
 
 
 class Key(Enum):
-    """Keys that the setup understands, named after their meaning."""
+    """Keys understood during setup, named after their meaning."""
 
     ACCEPT = auto()
     NEXT = auto()
@@ -24,7 +24,7 @@ class Key(Enum):
     QUIT = auto()
 
 
-# Names of each key in GLFW, and the bytes that a terminal sends for the key.
+# Each key's names in GLFW, and the byte sequences that a terminal sends for it.
 _MEANINGS: dict[Key, tuple[str, tuple[bytes, ...]]] = {
     Key.RIGHT: ("RIGHT", (b"\x1b[C",)),
     Key.LEFT: ("LEFT", (b"\x1b[D",)),
@@ -42,7 +42,7 @@ def parse(data: bytes) -> tuple[list[Key], bytes]:
     """Decode bytes from a terminal.
 
     Returns:
-        The keys, and the bytes of an escape sequence that is still incomplete.
+        The keys, and the bytes of any escape sequence that is still incomplete.
     """
     keys: list[Key] = []
     while data:
@@ -62,16 +62,16 @@ class TerminalKeys:
     """
 
     def __init__(self, descriptor: int | None = None, *, quit_at_end: bool = True) -> None:
-        """Choose the input without changing the mode of the terminal.
+        """Choose the input without changing the terminal's mode.
 
         Args:
-            descriptor: File descriptor to read, by default that of standard input.
-            quit_at_end: Report the end of the input as the key `QUIT`. Otherwise no more keys are reported.
+            descriptor: File descriptor to read. Defaults to standard input.
+            quit_at_end: Report the end of input as the `QUIT` key. Otherwise no more keys are reported.
         """
         self._quit_at_end = quit_at_end
         self._descriptor = _standard_input() if descriptor is None else descriptor
         self._rest = b""
-        self._mode: Any = None  # previous mode of the terminal
+        self._mode: Any = None  # the terminal's previous mode
 
     def poll(self) -> Key | None:
         """Return the next key without waiting, or None if no key was pressed."""
@@ -93,7 +93,7 @@ class TerminalKeys:
         return None
 
     def line(self) -> str:
-        """Wait for the next line and return it without surrounding blanks. The end of input returns `q`."""
+        """Wait for the next line and return it without surrounding blanks. Returns `q` at end of input."""
         self.close()
         data = b""
         while self._descriptor >= 0 and (read := os.read(self._descriptor, 1)) != b"\n":
@@ -103,7 +103,7 @@ class TerminalKeys:
         return data.decode(errors="replace").strip() if self._descriptor >= 0 else "q"
 
     def close(self) -> None:
-        """Restore the previous mode of the terminal. Further calls have no effect."""
+        """Restore the terminal's previous mode. Further calls have no effect."""
         if self._mode is not None:
             import termios
 
@@ -120,7 +120,7 @@ def _standard_input() -> int:
 
 
 class WindowKeys:
-    """Reader for keys that are pressed in the panels' windows.
+    """Reader for keys pressed in the panels' windows.
 
     GLFW delivers the keys when a frame is presented.
     """
@@ -133,7 +133,7 @@ class WindowKeys:
     def poll(self) -> Key | None:
         """Return the next key without waiting, or None if no key was pressed.
 
-        Must be called after a frame was presented, in the thread that created the windows.
+        Must be called after a frame has been presented, in the thread that created the windows.
         """
         handles = self._sink.window_handles
         if handles != self._watched:

@@ -1,6 +1,6 @@
 """Read, validate and store pairs of points.
 
-Each pair has a measured sensor point and a known stack point.
+Each pair consists of a point measured in the sensor frame and the same point's known position in the stack frame.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ Number = Annotated[float, BeforeValidator(_no_truth_value), AfterValidator(_boun
 
 
 class PairRow(BaseModel):
-    """Pair of points in metres as a row of the file, with the columns that `calibrate capture` adds."""
+    """A row in the file: a pair of points in metres, with the columns that `calibrate capture` adds."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", coerce_numbers_to_str=True)
 
@@ -58,7 +58,7 @@ class PairRow(BaseModel):
 
     @classmethod
     def of(cls, sensor_m: F64, stack_m: F64, viewpoint: str, *, serial: str, spread_mm: str = "") -> PairRow:
-        """Create the row for a point (3,) in the frame `sensor` and the same point in the frame `stack`."""
+        """Create the row for a point (3,), given in both the `sensor` frame and the `stack` frame."""
         sx, sy, sz, wx, wy, wz = np.concatenate([sensor_m, stack_m]).tolist()
         return cls(
             sensor_x=sx, sensor_y=sy, sensor_z=sz, stack_x=wx, stack_y=wy, stack_z=wz,
@@ -75,8 +75,8 @@ class Pairs:
 
     sensor_m: F64  # (K, 3) measured points, frame `sensor`
     stack_m: F64  # (K, 3) known points, frame `stack`
-    names: tuple[str, ...]  # names of the pairs for messages
-    source: str  # path of the file
+    names: tuple[str, ...]  # names of the pairs, used in messages
+    source: str  # the file's path
     sensor_serial: str = ""  # serial number of the sensor that measured all pairs; empty if unknown
 
     def __len__(self) -> int:
@@ -89,7 +89,7 @@ def read_pairs(path: Path) -> Pairs:
     A JSON file contains a list of objects, or an object `{"pairs": [...]}` with such a list.
 
     Raises:
-        InputError: The file cannot be read, has too many pairs or pairs of different sensors, or contains invalid
+        InputError: The file cannot be read, has too many pairs or pairs from different sensors, or contains invalid
             values. The message names the rows and columns.
     """
     labels, rows = _read_rows(path)
@@ -106,7 +106,7 @@ def read_pairs(path: Path) -> Pairs:
 
 
 def _read_rows(path: Path) -> tuple[list[str], list[PairRow]]:
-    """Read a file, and return a label for each pair (its line or number) and the pairs.
+    """Read a file, and return a label for each pair (its line or number) as well as the pairs.
 
     Raises InputError if the file cannot be read or a value is invalid. The message names the rows and columns.
     """
@@ -149,7 +149,7 @@ def _problem(error: Any) -> str:
 
 
 def points_of(rows: Iterable[PairRow]) -> tuple[F64, F64]:
-    """Return the points (K, 3) in the frame `sensor` and the points (K, 3) in the frame `stack`."""
+    """Return the rows' points in the `sensor` frame and in the `stack` frame, each as a (K, 3) array."""
     table = np.array([[getattr(row, name) for name in COLUMNS] for row in rows], dtype=np.float64).reshape(-1, 6)
     return table[:, :3].copy(), table[:, 3:].copy()
 
@@ -157,7 +157,7 @@ def points_of(rows: Iterable[PairRow]) -> tuple[F64, F64]:
 class PairsFile:
     """CSV file of the pairs accepted so far.
 
-    Every change is written immediately, so an interruption loses no pair.
+    Every change is written immediately, so no pair is lost if the program is interrupted.
     """
 
     def __init__(self, path: Path) -> None:
@@ -178,7 +178,7 @@ class PairsFile:
     def accept(self, *pairs: PairRow) -> None:
         """Add pairs from one sensor and write the file. Existing pairs at the same viewpoints are replaced.
 
-        Raises InputError if the file has pairs of another sensor, or cannot be written.
+        Raises InputError if the file has pairs from another sensor, or cannot be written.
         """
         serial, replaced = pairs[0].sensor_serial, {pair.viewpoint for pair in pairs} - {""}
         others = {row.sensor_serial for row in self.rows} - {"", serial}

@@ -1,7 +1,7 @@
-"""Project pixels of panels at their actual poses into eyes and cameras.
+"""Project the pixels of panels, placed at their actual poses, into eyes and cameras.
 
-A panel's frame has its origin at the centre of the panel. Its x axis points out of the screen, y points along the rows
-of pixels to the viewer's right, and z points up. All panels have the pixel pitch of the stack.
+A panel's frame has its origin at the panel's centre. Its x axis points out of the screen, y points along the pixel rows
+to the viewer's right, and z points up. All panels have the stack's pixel pitch.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ HOMOGENEOUS = np.array([0.0, 0.0, 1.0])  # row that selects the third component 
 
 @dataclass(frozen=True, slots=True)
 class PlacedPanel:
-    """Actual pose of one panel in the frame `stack`."""
+    """One panel's actual pose in the `stack` frame."""
 
     rotation: F64  # (3, 3) stack_from_panel
-    centre_m: F64  # (3,) centre of the panel, frame `stack`
+    centre_m: F64  # (3,) the panel's centre, frame `stack`
 
     @property
     def slope(self) -> F64:
-        """Slope (2,) of the panel: the increase of x per metre to the right and per metre up."""
+        """The panel's slope (2,): the increase in x per metre to the right and per metre up."""
         normal = self.rotation[:, 0]
         return np.asarray(-normal[1:] / normal[0], dtype=np.float64)
 
     @property
     def axis_x_m(self) -> float:
-        """Position at which the panel's plane intersects the x axis of the stack."""
+        """Position where the panel's plane intersects the stack's x axis."""
         normal = self.rotation[:, 0]
         return float(normal @ self.centre_m / normal[0])
 
@@ -44,7 +44,7 @@ def through(matrix: F64, points_px: F64) -> F64:
 
 
 def corner_pixels(stack: PanelStack) -> F64:
-    """Return the corners (4, 2) of a panel in pixels, in the order (0, 0), (W, 0), (W, H), (0, H)."""
+    """Return a panel's corners (4, 2) in pixels, in the order (0, 0), (W, 0), (W, H), (0, H)."""
     w, h = stack.width_px, stack.height_px
     return np.array([[0, 0], [w, 0], [w, h], [0, h]], dtype=np.float64)
 
@@ -60,11 +60,11 @@ def stack_from_pixels(panel: PlacedPanel, stack: PanelStack) -> F64:
 
 
 def true_from_ideal_seen(panel: PlacedPanel, eye_m: ArrayLike, stack: PanelStack, index: int) -> F64:
-    """Return the homography (3, 3) from ideal to actual pixels as an eye sees them, with last entry 1.
+    """Return the 3x3 homography from ideal to actual pixels as seen by an eye, with 1 as its last entry.
 
-    A ray from the eye crosses the nominal plane of panel `index` at the ideal pixel, and the panel at the actual pixel.
-    The homography depends on the eye only if the panel is tilted or is not at its nominal `x_m`. Raises ValueError if
-    the eye is in the plane of the panel.
+    A ray from the eye crosses panel `index`'s nominal plane at the ideal pixel, and the panel itself at the actual
+    pixel. The homography depends on the eye only if the panel is tilted or is not at its nominal `x_m`. Raises
+    ValueError if the eye is in the plane of the panel.
     """
     eye = np.outer(np.asarray(eye_m, dtype=np.float64), HOMOGENEOUS)
     seen = stack_from_pixels(panel, stack) - eye

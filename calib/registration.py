@@ -1,9 +1,9 @@
-"""Measure the poses of the panels, with standard errors, from photographs of the calibration boards.
+"""Measure the panels' poses, with standard errors, from photographs of the calibration boards.
 
 The middle panel is the reference: it defines the stack frame, and its picture is not resampled. For every other panel
 the configuration stores the actual distance and a homography from the pixels of an ideal panel, parallel to the
-reference, to the pixels of the actual panel. The homography of a parallel panel is exact for every eye position. That
-of a tilted panel is exact only at the viewing position, and the models correct the tilt at other positions.
+reference, to the pixels of the actual panel. A parallel panel's homography is exact for every eye position. A tilted
+panel's is exact only at the viewing position, and the models correct for the tilt at other positions.
 """
 
 from __future__ import annotations
@@ -30,34 +30,34 @@ from runtime.support.artifacts import write_json
 from runtime.support.progress import status_line
 
 MIN_PHOTOGRAPHS = 5  # minimum number of usable photographs
-MIN_SPAN_DEG = 15.0  # minimum angle between the two most different directions of the photographs
+MIN_SPAN_DEG = 15.0  # minimum angle between the two photographs whose directions differ most
 DISAGREES = 0.4  # share of outliers above which a photograph is excluded
 MISFIT_PX = 1.5  # residual above which the stack is not rigid or has moved
-IMPLAUSIBLE_M = 0.010  # displacement of a panel that is too large for an error of manual assembly
-DOUBTFUL_PX = 0.3  # uncertainty of a corner above which a registration is refused
+IMPLAUSIBLE_M = 0.010  # panel displacement that is too large to be an error in manual assembly
+DOUBTFUL_PX = 0.3  # corner uncertainty above which a registration is refused
 
 
 @dataclass(frozen=True, slots=True)
 class Registration:
-    """Measured geometry of the stack and homographies of the panels, with their uncertainties."""
+    """The stack's measured geometry and the panels' homographies, with their uncertainties."""
 
-    bundle: Bundle  # poses of the panels and the camera
+    bundle: Bundle  # poses of the panels and camera positions
     stack: PanelStack  # geometry to configure, with actual distances and tilts
     gap_sigma_m: F64  # (N-1,) standard deviations of the gaps
     homographies: F64  # (N, 3, 3) from ideal pixels of `stack` to pixels of the actual panels
     corners_px: F64  # (N, 4, 2) displacements of the corners (0, 0), (W, 0), (W, H), (0, H)
     corner_sigma_px: F64  # (N, 4, 2) standard deviations of the displacements
-    eye_m: F64  # (3,) viewing position for which the homographies are exact, frame `stack`
+    eye_m: F64  # (3,) viewing position where the homographies are exact, frame `stack`
     used: int  # number of photographs used
-    notes: list[str]  # names of the excluded photographs, with reasons
+    notes: list[str]  # the excluded photographs' names, with reasons
 
     @property
     def sigma_panel_px(self) -> F64:
-        """RMS uncertainty (N,) of the four corners of each panel, in panel pixels."""
+        """RMS uncertainty (N,) of each panel's four corners, in panel pixels."""
         return np.asarray(np.sqrt((self.corner_sigma_px**2).sum(-1).mean(-1)), dtype=np.float64)
 
     def eye_error_mm(self) -> float:
-        """Return the eye movement in mm that would have the same effect as the worst panel's uncertainty."""
+        """Return the eye movement, in mm, that would have the same effect as the worst panel's uncertainty."""
         gap_m = np.abs(np.array(self.stack.x_m) - self.stack.x_m[self.bundle.reference])
         pitch_m, others = self.stack.width_m / self.stack.width_px, gap_m > 0
         return float((self.sigma_panel_px[others] * pitch_m * self.eye_m[0] / gap_m[others]).max()) * 1e3
@@ -72,9 +72,9 @@ def geometry_of(panels: Sequence[PlacedPanel], stack: PanelStack, *, eye_m: F64)
     """Return the geometry to configure for panels at their measured poses.
 
     Args:
-        panels: Poses of the panels from rear to front.
+        panels: The panels' poses, from rear to front.
         stack: Configured geometry, whose distances and tilts are replaced.
-        eye_m: Viewing position (3,) for which the panels are registered, in the frame `stack`.
+        eye_m: Viewing position (3,) that the panels are registered for, in the `stack` frame.
 
     Raises:
         Undetermined: The panels are not in the configured order.
@@ -88,14 +88,14 @@ def geometry_of(panels: Sequence[PlacedPanel], stack: PanelStack, *, eye_m: F64)
 
 
 def register_photographs(seen: Sequence[SeenMarks], stack: PanelStack, *, eye_m: F64) -> Registration:
-    """Fit the poses of the panels to the marks in photographs, and check the result.
+    """Fit the panels' poses to the marks found in photographs, and check the result.
 
     Photographs that are faulty, differ in size or contradict the others are excluded.
 
     Args:
         seen: Marks found in each photograph.
         stack: Configured geometry.
-        eye_m: Viewing position (3,) for which the panels are registered, in the frame `stack`.
+        eye_m: Viewing position (3,) that the panels are registered for, in the `stack` frame.
 
     Raises:
         Undetermined: The photographs are too few, too similar or inconsistent, or the result is implausible or too
@@ -195,18 +195,18 @@ def register_photos(
     """Register the panels from photographs and write `registration.json`.
 
     Args:
-        pictures: Names and grey pixels (h, w) of the photographs.
-        source: Origin of the photographs, for error messages.
+        pictures: The photographs' names and grey pixels (h, w).
+        source: Origin of the photographs, used in error messages.
         out: Folder for `registration.json`.
-        settings: Configuration of the display.
+        settings: Display configuration.
         config: Configuration file to update with the registration, or None.
 
     Returns:
-        The summary of the command.
+        A summary of the run, for the command to report.
 
     Raises:
-        InputError: The photographs do not determine the panels, or `config` describes another number of panels.
-            Nothing is written.
+        InputError: The photographs do not determine the panels' poses, or `config` describes a different number of
+            panels. Nothing is written.
     """
     stack = settings.stack.stack()
     if config is not None and len(settings.output.panels) not in (0, stack.count):
@@ -231,7 +231,7 @@ def register_photos(
 
 
 def put_registration(document: TOMLDocument, registered: Registration) -> None:
-    """Set the distances and tilts of the panels and their homographies in a configuration."""
+    """Set the panels' distances, tilts and homographies in a configuration."""
     matrices = registered.homographies.tolist()
     put_panels(document, "homography", dict(enumerate(matrices)), panels=len(matrices))
     tilt = registered.stack.tilt

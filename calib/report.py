@@ -1,4 +1,4 @@
-"""Write a page with the error at every calibration point and the other figures (`calibrate report`)."""
+"""Write a page with the error at every calibration point and other figures (`calibrate report`)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ COLOURS = {"X": "#c0392b", "Y": "#27803b", "Z": "#2260a8"}
 
 
 class StoredPairs(Lenient):
-    """Table `[data]` of a calibration file, with the pairs from which the calibration was computed."""
+    """The `[data]` table of a calibration file, with the pairs used to compute the calibration."""
 
     sensor_m: tuple[Vector3, ...]  # measured positions, frame `sensor`
     stack_m: tuple[Vector3, ...]  # known positions, frame `stack`
@@ -37,7 +37,7 @@ class StoredPairs(Lenient):
 
 
 class Points(NamedTuple):
-    """Errors of a calibration at the pairs from which it was computed."""
+    """A calibration's errors at the pairs used to compute it."""
 
     names: tuple[str, ...]
     residual_m: F64  # (K, 3) calibrated minus true positions, frame `stack`
@@ -50,7 +50,7 @@ def write_report(file: Path, out: Path, *, viewing: CalibrationSettings) -> dict
     Args:
         file: Calibration file.
         out: Folder to write to.
-        viewing: Settings of the viewing range, over which the error at the eye is averaged.
+        viewing: Viewing range settings. The error at the eye is averaged over this range.
 
     Returns:
         The contents of `report.json`.
@@ -80,7 +80,7 @@ def write_report(file: Path, out: Path, *, viewing: CalibrationSettings) -> dict
 
 
 def _stored_points(data: Any, calibration: Calibration, *, source: Path) -> Points | None:
-    """Return the errors at the pairs in a file's table `[data]`, or None if the file contains no pairs.
+    """Return the errors at the pairs in a file's `[data]` table, or None if the file contains no pairs.
 
     Raises InputError if the table is invalid.
     """
@@ -91,11 +91,11 @@ def _stored_points(data: Any, calibration: Calibration, *, source: Path) -> Poin
 
 
 def residual_figure(points: Points, *, limit_m: float) -> bytes:
-    """Plot the errors of every calibration point in mm, as in figure S5 of the EyeReal supplement.
+    """Plot every calibration point's errors in mm, as in the EyeReal supplement's figure S5.
 
     Args:
         points: Errors at the calibration points.
-        limit_m: Error at which dashed lines are drawn, in metres.
+        limit_m: Error to mark with dashed lines, in metres.
 
     Returns:
         The plot as a PNG file.
@@ -124,7 +124,7 @@ def residual_figure(points: Points, *, limit_m: float) -> bytes:
 
 
 def _summary(calibration: Calibration, points: Points | None, volume_m: F64) -> dict[str, Any]:
-    """Return the contents of `report.json`, in which None marks unknown values."""
+    """Return the contents of `report.json`, with None for unknown values."""
     found: dict[str, Any] = {
         "method": calibration.file.method,
         "date": str(calibration.file.date),

@@ -1,7 +1,8 @@
-"""Fit a similarity to pairs of points of which some may have gross errors.
+"""Fit a similarity to pairs of points, some of which may have gross errors.
 
 Least trimmed squares (Rousseeuw 1984) with concentration steps (FAST-LTS, Rousseeuw & Van Driessen 1999) finds the half
-of the pairs that agree best. The noise is estimated from this half, and pairs with much larger errors are rejected.
+of the pairs that agree best. The noise is estimated from this half, and pairs whose errors are much larger are
+rejected.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ STEPS = 4  # number of concentration steps from each subset
 MAX_SCORED = 2000  # number of pairs above which the search uses a random sample; all pairs are then tested
 REJECTION_PROBABILITY = 1e-4  # probability that a good pair with Gaussian noise is rejected
 RULE: ScaleRule = "inverse"
-MIN_NOISE = 1e-12  # least noise relative to the points' extent, because rounding must not reject exact data
+MIN_NOISE = 1e-12  # minimum noise relative to the points' extent, so that exact data are not rejected
 
 
 @dataclass(frozen=True, slots=True)
 class RobustFit:
-    """Similarity that was fitted to the pairs that agree with each other."""
+    """A similarity fitted to the pairs that agree with each other."""
 
     similarity: Similarity
     inlier: NDArray[np.bool_]  # (K,) True for pairs that agree, False for rejected pairs
@@ -45,7 +46,7 @@ def _residuals(candidate: Similarity, sensor_m: F64, stack_m: F64) -> F64:
 def _best_half(sensor_m: F64, stack_m: F64, *, random: np.random.Generator) -> NDArray[np.intp]:
     """Return the indices of the half of the pairs that agree best.
 
-    The search starts from many random subsets. Each fit is repeated with the half of the pairs that it fits best.
+    The search starts from many random subsets. Each fit is then repeated on the half of the pairs that it fits best.
     """
     count = len(sensor_m)
     keep = min(count, max(3, (count + 5) // 2))
@@ -64,11 +65,11 @@ def _best_half(sensor_m: F64, stack_m: F64, *, random: np.random.Generator) -> N
 def fit_robust(sensor_m: F64, stack_m: F64) -> RobustFit:
     """Fit a similarity to those pairs that agree with each other. The result is deterministic.
 
-    Five pairs or fewer have no clear majority, so all of them are used.
+    Among five pairs or fewer there is no clear majority, so all of them are used.
 
     Args:
-        sensor_m: Points (K, 3) in the frame `sensor`, where K is at least 3.
-        stack_m: The same points (K, 3) in the frame `stack`.
+        sensor_m: Points (K, 3) in the `sensor` frame, where K is at least 3.
+        stack_m: The same points (K, 3) in the `stack` frame.
 
     Raises:
         Degenerate: The points do not determine a similarity, as in `similarity.fit`.
@@ -105,9 +106,9 @@ def fit_robust(sensor_m: F64, stack_m: F64) -> RobustFit:
 
 
 def _noise(similarity: Similarity, sensor_m: F64, stack_m: F64, inlier: NDArray[np.bool_]) -> float:
-    """Return the standard deviation of one coordinate of the inliers in the frame `stack`.
+    """Return the inliers' standard deviation per coordinate in the `stack` frame.
 
-    The seven parameters of the fit reduce the degrees of freedom.
+    The fit's seven parameters are subtracted from the degrees of freedom.
     """
     squared = ((similarity.points(sensor_m) - stack_m) ** 2).sum(-1)[inlier].sum()
     return float(np.sqrt(squared / max(3 * int(inlier.sum()) - 7, 1)))

@@ -1,6 +1,6 @@
-"""Guide a person through the setup of a display, which can be interrupted and resumed.
+"""Guide the user through setting up a display, which can be interrupted and resumed.
 
-The command `phasestack setup` uses this module.
+Used by the `phasestack setup` command.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ MAX_PROGRESS_BYTES = 4 << 20  # size limit for setup.json
 
 
 def progress_path(config: Path) -> Path:
-    """Return the path of the file next to the configuration that records the progress of the setup."""
+    """Return the path of the file that records the setup's progress, next to the configuration."""
     return config.with_name(f"{config.stem}.setup.json")
 
 
 def read_progress(path: Path) -> dict[str, Any]:
-    """Return the figures of the finished steps by the name of the step.
+    """Return the finished steps' figures, keyed by step name.
 
     Raises InputError if the file is invalid.
     """
@@ -50,16 +50,16 @@ def run_setup(
     Args:
         config: Configuration file to create or change.
         out: Folder for reports and for the files that the configuration uses.
-        photos: Folder into which the person puts photographs.
+        photos: Folder where the user puts photographs.
         simulate: Simulate the monitors, the panels and the sensor.
-        seed: Seed of the simulation.
+        seed: Simulation seed.
         to_stderr: Write all messages to stderr instead of stdout.
 
     Returns:
         The summary as a dictionary and as text.
 
     Raises:
-        InputError: The configuration or the file that records the progress is invalid.
+        InputError: The configuration file or the progress file is invalid.
     """
 
     def say(text: str) -> None:
@@ -85,7 +85,7 @@ def run_setup(
 def walk_through(setup: Setup) -> bool:
     """Run the steps from the first unfinished one.
 
-    Returns True after the last step, or False if the person stops.
+    Returns True after the last step, or False if the user stops.
     """
     number = next((n for n, step in enumerate(STEPS) if step.name not in setup.done), 0)
     while number < len(STEPS):
@@ -118,7 +118,7 @@ def _is_done(setup: Setup, step: SetupStep) -> bool:
 
 
 def summarise(setup: Setup, *, finished: bool) -> tuple[dict[str, Any], str]:
-    """Return the summary as a dictionary and as text. The summary of a finished setup is also written.
+    """Return the summary as a dictionary and as text. If the setup is finished, it is also written.
 
     The text ends with the commands to run next.
     """

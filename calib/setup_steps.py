@@ -1,4 +1,4 @@
-"""Steps of `phasestack setup`. Each asks questions, changes the configuration and reports figures."""
+"""Steps run by `phasestack setup`. Each asks questions, edits the configuration and reports figures."""
 
 from __future__ import annotations
 
@@ -31,29 +31,29 @@ from runtime.support.artifacts import OutputFolder, write_bytes, write_text
 Figures = dict[str, Any]
 MIN_PAIRS = 9  # minimum number of viewpoints for a calibration, out of 27
 SERVICE_FOLDER = "/etc/phasestack"
-MAX_BYTES = 64 << 20  # size limit for a file copied for the service
+MAX_BYTES = 64 << 20  # size limit for each file copied for the service
 ARROWS: dict[Key, Arrow] = {Key.UP: "up", Key.DOWN: "down", Key.LEFT: "left", Key.RIGHT: "right"}
 YES_NO = {Key.ACCEPT: True, Key.NEXT: False}
 
 
 class SetupStopped(Exception):
-    """Raised when the person stops a step or the setup."""
+    """Raised when the user stops a step or the setup."""
 
 
 @dataclass
 class Setup:
-    """State that all steps of the setup share."""
+    """State shared by all setup steps."""
 
     config: Path  # configuration file
     out: Path  # folder for reports and for files that the configuration uses
     hardware: SetupHardware
-    say: Say  # shows a line of text to the person
-    line: Callable[[], str]  # returns the next line that the person types
-    done: dict[str, Figures] = field(default_factory=dict)  # figures of the finished steps by the name of the step
+    say: Say  # shows a line of text to the user
+    line: Callable[[], str]  # returns the next line that the user types
+    done: dict[str, Figures] = field(default_factory=dict)  # the finished steps' figures, keyed by step name
 
     @property
     def settings(self) -> Settings:
-        """Current configuration, which is loaded on every access. A missing file means the defaults."""
+        """Current configuration, loaded on every access. If the file is missing, the defaults apply."""
         return load_settings(self.config if untrusted_input.is_there(self.config) else None)
 
     def ask(self, question: str, default: str = "") -> str:
@@ -70,18 +70,18 @@ class Setup:
 
 @dataclass(frozen=True, slots=True)
 class SetupStep:
-    """Step of the setup, with the texts that introduce it to the person."""
+    """A setup step, with the text that introduces it to the user."""
 
     name: str
     title: str
-    what: str  # explanation in one line
+    what: str  # one-line explanation
     run: Callable[[Setup], Figures]  # performs the step and returns its figures
 
 
 def identify(setup: Setup) -> Figures:
     """Step 1: assign the monitors to the panels and determine how each panel is mounted.
 
-    One monitor at a time shows a card, and the person answers questions about the card.
+    One monitor at a time shows a card, and the user answers questions about it.
     """
     hardware, count = setup.hardware, setup.settings.stack.stack().count
     monitors = hardware.monitors()
@@ -119,9 +119,9 @@ def _name_of(monitor: Monitor, monitors: Sequence[Monitor]) -> dict[str, Any]:
 
 
 def geometry(setup: Setup) -> Figures:
-    """Step 2: ask for the sizes of the panels, the approximate gap and the viewing distances.
+    """Step 2: ask for the panels' size, the approximate gap and the viewing distances.
 
-    The registration measures the gaps exactly later.
+    The exact gaps are measured later, during registration.
     """
     stack, calibration = setup.settings.stack, setup.settings.calibration
 
@@ -159,7 +159,7 @@ def geometry(setup: Setup) -> Figures:
 
 
 def registration(setup: Setup) -> Figures:
-    """Step 3: measure the actual poses of the panels from photographs of the calibration boards."""
+    """Step 3: measure the panels' actual poses from photographs of the calibration boards."""
     rewrite(setup.config, lambda document: None)  # creates an empty configuration if none exists
     settings = setup.settings
     pictures = setup.hardware.photographs(settings, boards(settings.stack.stack()), panel=None, say=setup.say)
@@ -170,7 +170,7 @@ def registration(setup: Setup) -> Figures:
 
 
 def grey(setup: Setup) -> Figures:
-    """Step 4: measure the grey curve of each panel from photographs of a chart.
+    """Step 4: measure each panel's grey curve from photographs of a chart.
 
     Each curve is saved as soon as it is measured.
     """
@@ -195,7 +195,7 @@ def grey(setup: Setup) -> Figures:
 
 
 def _measure_grey(setup: Setup, panel: int) -> float:
-    """Measure the grey curve of a panel, add it to the configuration and return its relative error."""
+    """Measure a panel's grey curve, add it to the configuration and return its relative error."""
     settings = setup.settings
     stack = settings.stack.stack()
     pictures = setup.hardware.photographs(settings, grey_charts(stack, panel), panel=panel, say=setup.say)
@@ -228,7 +228,7 @@ def sensor(setup: Setup) -> Figures:
 
 
 def calibration(setup: Setup) -> Figures:
-    """Step 6: measure the pose of the sensor while a person moves from viewpoint to viewpoint."""
+    """Step 6: measure the sensor's pose while the user moves from viewpoint to viewpoint."""
     pairs_path, target = setup.out / "pairs.csv", setup.out / "calibration.toml"
     count = capture_live(pairs_path, setup.settings, setup.hardware, show=True, say=setup.say)["pairs"]
     if count < MIN_PAIRS:
@@ -241,9 +241,9 @@ def calibration(setup: Setup) -> Figures:
 
 
 def service(setup: Setup) -> Figures:
-    """Step 7: collect the files of the service in a folder and install them.
+    """Step 7: collect the service's files in a folder and install them.
 
-    Without root permissions, or in a simulation, the commands for the installation are printed instead.
+    Without root permissions, or in a simulation, the installation commands are printed instead.
     """
     folder = (setup.out / "service").resolve()
     files = gather(setup.config, folder)
@@ -268,7 +268,7 @@ def service(setup: Setup) -> Figures:
 def gather(config: Path, out: Path) -> list[str]:
     """Copy the configuration, the calibration and the grey curves to a folder, and return the file names.
 
-    All other files stay where they are, and the copy of the configuration refers to them by absolute paths. Raises
+    All other files stay where they are, and the copied configuration refers to them by absolute paths. Raises
     InputError if a file cannot be read or written.
     """
     if not config.exists():

@@ -1,14 +1,15 @@
 """Fit a similarity to pairs of points in closed form (EyeReal supplement, (19)-(27)).
 
-A similarity maps a point c in the frame `sensor` to the point w = s·R·c + t in the frame `stack`. The rotation
+A similarity maps a point c in the `sensor` frame to the point w = s·R·c + t in the `stack` frame. The rotation
 maximises the correlation of the centred points (Kabsch, Umeyama 1991). The scale depends on a rule:
 
-* `seed` is the ratio of the RMS radii (EyeReal, (22)), which is the geometric mean of the next two scales.
-* `least-squares` minimises the error in the stack (EyeReal, (20), Umeyama). Noise in the sensor makes the scale too
+* `seed` is the ratio of the RMS radii (EyeReal, (22)), which is the geometric mean of the next two scales listed.
+* `least-squares` minimises the error in the stack frame (EyeReal, (20), Umeyama). Sensor noise makes this scale too
   small.
-* `inverse` minimises the error in the sensor: the fit is made from the stack to the sensor and inverted. The scale is
-  consistent if the stack's points are exact and the sensor's points are noisy, as in a calibration.
-* A number is a known scale.
+* `inverse` minimises the error in the sensor frame: the similarity is fitted from the stack to the sensor, then
+  inverted. This scale is consistent if the stack's points are exact and the sensor's points are noisy, as in a
+  calibration.
+* A number is used as the known scale.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from runtime.records import F64
 
 ScaleRule = Literal["seed", "least-squares", "inverse"] | float
 EPSILON = float(np.finfo(np.float64).eps)
-ROTATION_BOUND_RAD = 1e-6  # rotation by rounding errors above which points are refused
+ROTATION_BOUND_RAD = 1e-6  # rotation caused by rounding errors above which points are refused
 POLISH_ABOVE = 1e2  # ratio of the points' two largest extents above which the cross-covariance loses digits
 
 
@@ -37,9 +38,9 @@ class Degenerate(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Similarity:
-    """Similarity from the frame `sensor` to the frame `stack`, or a batch of similarities."""
+    """Similarity from the `sensor` frame to the `stack` frame, or a batch of similarities."""
 
-    scale: F64  # (...), where the leading dimensions are those of the batch
+    scale: F64  # (...), the dimensions of the batch
     rotation: F64  # (..., 3, 3)
     translation_m: F64  # (..., 3), frame `stack`
 
@@ -53,7 +54,7 @@ class Similarity:
         return matrix
 
     def points(self, sensor_m: ArrayLike) -> F64:
-        """Transform points (..., K, 3) from the frame `sensor` to the frame `stack`."""
+        """Transform points (..., K, 3) from the `sensor` frame to the `stack` frame."""
         linear = self.scale[..., None, None] * self.rotation
         return np.asarray(sensor_m) @ np.swapaxes(linear, -1, -2) + self.translation_m[..., None, :]
 
@@ -61,7 +62,7 @@ class Similarity:
 def _centred(points: F64) -> tuple[F64, F64]:
     """Return the centred points and their mean.
 
-    Two passes keep the precision of points far from the origin.
+    The mean is computed in two passes to preserve precision for points far from the origin.
     """
     mean = np.zeros((*points.shape[:-2], 1, 3))
     for _ in range(2):
@@ -82,7 +83,7 @@ def _scale(rule: ScaleRule, *, sensor_power: F64, stack_power: F64, correlation:
 def fit_batch(sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> Similarity:
     """Fit a similarity to each set of pairs in a batch (..., K, 3), without checks.
 
-    Degenerate points cause infinities or NaN.
+    Degenerate points result in infinities or NaN.
     """
     sensor, sensor_mean = _centred(sensor_m)
     stack, stack_mean = _centred(stack_m)
@@ -102,7 +103,7 @@ def fit_batch(sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> Similarity:
 
 
 def extents(points_m: F64) -> F64:
-    """Return the RMS extents (3,) of points (K, 3) along their principal axes in metres, largest first."""
+    """Return the RMS extents (3,) of points (K, 3) along their principal axes, in metres, largest first."""
     centred, _ = _centred(points_m)
     size = float(np.abs(centred).max(initial=0.0))
     if size == 0.0:
@@ -112,11 +113,11 @@ def extents(points_m: F64) -> F64:
 
 
 def fit(sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> Similarity:
-    """Fit a similarity to pairs of points with full double precision.
+    """Fit a similarity to pairs of points in full double precision.
 
     Args:
-        sensor_m: Points (K, 3) in the frame `sensor`, where K is at least 3.
-        stack_m: The same points (K, 3) in the frame `stack`.
+        sensor_m: Points (K, 3) in the `sensor` frame, where K is at least 3.
+        stack_m: The same points (K, 3) in the `stack` frame.
         rule: Rule for the scale, or the known scale.
 
     Raises:
@@ -130,7 +131,8 @@ def fit(sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> Similarity:
         raise Degenerate("not every coordinate is finite")
     _refuse_degenerate("sensor", sensor_m)
     first, second = _refuse_degenerate("stack", stack_m)
-    # Scale by powers of two, which is exact. Squares of 1e-200 m or 1e200 m would be outside the range of float64.
+    # Scale by powers of two, which is exact. Without scaling, the squares of 1e-200 m or 1e200 m would fall outside
+    # float64's range.
     sensor_unit, stack_unit = (float(np.exp2(np.frexp(np.abs(p).max())[1])) for p in (sensor_m, stack_m))
     unit_rule = rule if isinstance(rule, str) else rule * sensor_unit / stack_unit
     unit_sensor, unit_stack = sensor_m / sensor_unit, stack_m / stack_unit
@@ -159,17 +161,17 @@ def _refuse_degenerate(name: str, points_m: F64) -> tuple[float, float]:
 
 
 def _polished(start: Similarity, sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> Similarity:
-    """Refine the fit for points that form a long, thin cloud.
+    """Refine a fit for points that form a long, thin cloud.
 
-    The cross-covariance squares the aspect ratio of the cloud and loses digits. In the principal frame of the stack's
-    points, the rotation about the long axis has a closed form that involves only the small coordinates. Gauss-Newton
-    steps with a QR solver refine the other two rotations. The error then grows with the aspect ratio instead of its
-    square.
+    Computing the cross-covariance squares the cloud's aspect ratio and loses digits. In the principal frame of the
+    stack's points, the rotation about the long axis has a closed form that involves only the small coordinates. The
+    other two rotations are refined by Gauss-Newton steps, solved with NumPy's `lstsq`. The error then grows with the
+    aspect ratio rather than with its square.
 
     Args:
         start: Fit to refine.
-        sensor_m: Points (K, 3) in the frame `sensor`.
-        stack_m: The same points (K, 3) in the frame `stack`.
+        sensor_m: Points (K, 3) in the `sensor` frame.
+        stack_m: The same points (K, 3) in the `stack` frame.
         rule: Rule for the scale, or the known scale.
     """
     sensor, sensor_mean = _centred(sensor_m)
@@ -194,7 +196,7 @@ def _polished(start: Similarity, sensor_m: F64, stack_m: F64, *, rule: ScaleRule
         rotation = Rotation.from_rotvec(step).as_matrix() @ rotation
         if np.abs(step).max() < 4 * EPSILON:
             break
-    # One Newton-Schulz step restores the orthogonality, of which each product of rotations loses an ulp.
+    # Each product of rotations loses an ulp of orthogonality, which one Newton-Schulz step restores.
     rotation = rotation @ (1.5 * np.eye(3) - 0.5 * rotation.T @ rotation)
     correlation = ((sensor @ rotation.T) * target).sum()
     scale = _scale(rule, sensor_power=(sensor**2).sum(), stack_power=(stack**2).sum(), correlation=correlation)

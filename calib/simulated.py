@@ -1,4 +1,4 @@
-"""Simulate the display, the sensor and the person for `setup --simulate`."""
+"""Simulate the display, the sensor and the user for `setup --simulate`."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from runtime.optics.stack import PanelStack
 from runtime.panels.monitors import Monitor
 from runtime.records import U8, EyePoints
 
-SENSOR_NOISE_M = 0.003  # standard deviation of each coordinate that the simulated depth camera measures
-STANDING_M = 0.002  # standard deviation per axis of a person's position when the lines seem fused
+SENSOR_NOISE_M = 0.003  # standard deviation of each coordinate measured by the simulated depth camera
+STANDING_M = 0.002  # standard deviation, per axis, of the user's position when the lines appear fused
 SAMPLES_HERE = 16  # number of sensor samples per viewpoint, at 30 samples per second
 
 
 class SimulatedHardware(SetupHardware):
-    """Simulated hardware: monitors in random order, a depth sensor, and a person at each viewpoint.
+    """Simulated hardware: monitors in random order, a depth sensor, and a user at each viewpoint.
 
-    The sensor has the same pose as the sensor of the built-in recording. The resulting configuration can therefore be
-    tried with `run --replay demo`.
+    The sensor has the same pose as in the built-in recording, so the resulting configuration can be tried with
+    `run --replay demo`.
     """
 
     simulated = True

@@ -16,30 +16,31 @@ from runtime.records import F64
 
 Method = Literal["seed", "least-squares", "inverse", "robust", "fixed-scale"]
 METHODS: tuple[Method, ...] = get_args(Method)
-# Prior of the scale's logarithm: the share and the standard deviation of three kinds of sensors. The scale of the first
-# kind is exact as far as pairs can show, that of the second is off by some percent, and the third has other units. The
-# resulting error exceeds that of the best method by at most 4%, both for an exact scale and for one that is off by up
-# to a tenth (tests/calib/test_methods.py). A share of 0.8 for exact sensors gave 2% and 6%.
+# Prior for the scale's logarithm: the share and the standard deviation for each of three kinds of sensors. The first
+# kind has a scale that is exact as far as pairs can show, the second's scale is off by a few percent, and the third
+# uses other units. The resulting error is at most 4% above the best method's, both for an exact scale and for one that
+# is off by up to a tenth (tests/calib/test_methods.py). With a share of 0.8 for exact sensors, these figures were 2%
+# and 6%.
 SCALE_PRIOR = np.array([(0.6, 0.0), (0.37, 0.06), (0.03, 1.0)])
-MIN_SIGMA = 1e-12  # least standard deviation of the scale's logarithm, for exact pairs
+MIN_SIGMA = 1e-12  # minimum standard deviation of the scale's logarithm, for exact pairs
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationSolution:
-    """Calibration that one method computed from K pairs, with its residuals and covariance.
+    """A calibration computed from K pairs by one method, with its residuals and covariance.
 
     The seven parameters and the pivot are defined in `runtime.eyes.calibration`.
     """
 
     method: Method
-    similarity: Similarity  # from the frame `sensor` to the frame `stack`
+    similarity: Similarity  # from the `sensor` frame to the `stack` frame
     residual_m: F64  # (K, 3) fitted minus known positions of all pairs, frame `stack`
     used: NDArray[np.bool_]  # (K,) False for pairs that were rejected as outliers
-    noise_m: float  # standard deviation of one coordinate of the used pairs, frame `stack`
+    noise_m: float  # standard deviation, per coordinate, of the used pairs, frame `stack`
     pivot_m: F64  # (3,) centre of the used pairs, frame `stack`
     unit_covariance: F64  # (7, 7) covariance for noise of 1 m, with zeros for a scale that is known exactly
     condition: float  # condition number of the design matrix, with lengths in units of the pairs' RMS radius
-    reason: str = ""  # reason for the choice of this method
+    reason: str = ""  # reason for choosing this method
 
     @property
     def covariance(self) -> F64:
@@ -67,11 +68,11 @@ class CalibrationSolution:
         return float(np.sqrt(self.covariance[6, 6]))
 
     def eye_error_m(self, stack_m: F64, *, noise_m: float | None = None) -> F64:
-        """Return the expected RMS error of the calibration at some points, in metres.
+        """Return the calibration's expected RMS error at the given points, in metres.
 
         Args:
-            stack_m: Points (..., 3) in the frame `stack`.
-            noise_m: Standard deviation of one coordinate of the pairs. By default, the observed noise is used.
+            stack_m: Points (..., 3) in the `stack` frame.
+            noise_m: Standard deviation of the pairs, per coordinate. Defaults to the observed noise.
 
         Returns:
             An array (...) with the error at each point.
@@ -85,12 +86,12 @@ class CalibrationSolution:
 def design_covariance(stack_m: F64, *, fixed_scale: bool) -> tuple[F64, F64, float]:
     """Return the pivot (3,), the covariance (7, 7) for noise of 1 m, and the design's condition number.
 
-    The covariance is of first order and assumes equal, independent noise in every coordinate. Noise in the sensor must
-    be multiplied by the scale. If the points leave a parameter undetermined, the covariance and the condition number
-    are infinite.
+    The covariance is a first-order approximation that assumes equal, independent noise in every coordinate. If the
+    noise is given in the sensor frame, multiply it by the scale first. If the points leave a parameter undetermined,
+    the covariance and the condition number are infinite.
 
     Args:
-        stack_m: Known points (K, 3) in the frame `stack`.
+        stack_m: Known points (K, 3) in the `stack` frame.
         fixed_scale: Treat the scale as known, with zero variance.
     """
     pivot_m = stack_m.mean(0)
@@ -113,14 +114,14 @@ def design_covariance(stack_m: F64, *, fixed_scale: bool) -> tuple[F64, F64, flo
 def solve(
     sensor_m: F64, stack_m: F64, *, method: Method, known_scale: float = 1.0, reason: str = ""
 ) -> CalibrationSolution:
-    """Compute a calibration from pairs by one method, with all estimates of its error.
+    """Compute a calibration from pairs by one method, with all its error estimates.
 
     Args:
-        sensor_m: Measured points (K, 3) in the frame `sensor`.
-        stack_m: Known points (K, 3) in the frame `stack`.
+        sensor_m: Measured points (K, 3) in the `sensor` frame.
+        stack_m: Known points (K, 3) in the `stack` frame.
         method: Method to use.
-        known_scale: Scale for the method `fixed-scale`.
-        reason: Reason for the choice of the method, to be stored.
+        known_scale: Scale for the `fixed-scale` method.
+        reason: Reason for choosing the method, stored with the result.
 
     Raises:
         Degenerate: The points do not determine a similarity, as in `similarity.fit`.
@@ -148,15 +149,15 @@ def solve(
 
 
 def posterior_scale(fitted: float, *, sigma: float, freedom: int) -> tuple[float, float]:
-    """Return the mean and standard deviation of the log scale's posterior over the kinds of sensors.
+    """Return the mean and standard deviation of the log scale's posterior.
 
-    Averaging avoids a threshold between the kinds. It also leaves the fitted scale of a sensor that is off by a tenth
-    nearly unchanged.
+    The posterior is averaged over the kinds of sensors, which avoids a threshold between the kinds. It also leaves the
+    fitted scale nearly unchanged for a sensor whose scale is off by a tenth.
 
     Args:
-        fitted: Fitted logarithm of the scale.
+        fitted: Logarithm of the fitted scale.
         sigma: Standard deviation of `fitted`, as estimated from the residuals.
-        freedom: Degrees of freedom of the estimate `sigma`. The likelihood is therefore Student's t distribution.
+        freedom: Degrees of freedom of the estimate `sigma`. They make the likelihood a Student's t distribution.
     """
     shares, widths = SCALE_PRIOR.T
     noise = max(sigma, MIN_SIGMA) ** 2
@@ -171,12 +172,12 @@ def posterior_scale(fitted: float, *, sigma: float, freedom: int) -> tuple[float
 def solve_default(sensor_m: F64, stack_m: F64) -> CalibrationSolution:
     """Compute a calibration by the method with the least expected error at the eye.
 
-    If some pairs have gross errors, the method is `robust`. Otherwise it is `fixed-scale` with the posterior mean of
-    the scale, which is close to 1 unless the pairs contradict it. tests/calib/test_methods.py compares the methods.
+    If some pairs have gross errors, the method is `robust`. Otherwise it is `fixed-scale` with the scale's posterior
+    mean, which is close to 1 unless the pairs contradict that. tests/calib/test_methods.py compares the methods.
 
     Args:
-        sensor_m: Measured points (K, 3) in the frame `sensor`.
-        stack_m: Known points (K, 3) in the frame `stack`.
+        sensor_m: Measured points (K, 3) in the `sensor` frame.
+        stack_m: Known points (K, 3) in the `stack` frame.
 
     Raises:
         Degenerate: The points do not determine a similarity, as in `similarity.fit`.
@@ -198,6 +199,6 @@ def solve_default(sensor_m: F64, stack_m: F64) -> CalibrationSolution:
         f"prior 1 or off by about {100 * SCALE_PRIOR[1, 1]:g}%",
     )
     unit = solution.unit_covariance.copy()
-    # About the centre of the pairs, the scale is independent of the rotation and the shift.
+    # Taken about the pairs' centre, the scale is independent of the rotation and the shift.
     unit[6, 6] = (sigma / solution.noise_m) ** 2 if solution.noise_m > 0 else 0.0
     return replace(solution, unit_covariance=unit)

@@ -23,7 +23,7 @@ from runtime.records import F64
 if TYPE_CHECKING:
     from tomlkit.items import Array
 
-STORED_PAIRS = 500  # number of pairs up to which the calibration file contains them
+STORED_PAIRS = 500  # the calibration file contains the pairs if there are at most this many
 
 
 def solve_file(
@@ -32,14 +32,14 @@ def solve_file(
     """Compute a calibration from a file of pairs and write it.
 
     Args:
-        pairs_path: CSV or JSON file of the pairs.
-        out: Calibration file to write. The version that it replaces is kept.
-        settings: Configuration of the sensor, the panels and the viewing range.
-        method: Name of a method. If empty, the method with the least expected error at the eye is chosen.
-        known_scale: Scale for the method `fixed-scale`.
+        pairs_path: CSV or JSON file with the pairs.
+        out: Calibration file to write. The version it replaces is kept.
+        settings: Sensor, panel and viewing range configuration.
+        method: Method name. If empty, the method with the least expected error at the eye is chosen.
+        known_scale: Scale for the `fixed-scale` method.
 
     Returns:
-        The summary of the command, with the figures of every method.
+        A summary of the run with every method's figures, for the command to report.
 
     Raises:
         InputError: The pairs cannot be read or do not determine the calibration, or the method is unknown.
@@ -97,10 +97,10 @@ def calibration_text(
 
     Args:
         solution: Calibration to write.
-        pairs: Pairs from which the calibration was computed. They are stored in the table `[data]` for the report.
-        settings: Configuration of the sensor and the panels.
+        pairs: Pairs used to compute the calibration. They are stored in the `[data]` table for the report.
+        settings: Sensor and panel configuration.
         warnings: Warnings to store.
-        volume_m: Points (..., 3) in the frame `stack` over which the error at the eye is averaged.
+        volume_m: Points (..., 3) in the `stack` frame. The error at the eye is averaged over them.
 
     Returns:
         The TOML text.

@@ -1,6 +1,6 @@
 """Define the calibration viewpoints and the viewing volume.
 
-The viewpoints are those of EyeReal, section 2.3, extended to any distance.
+The viewpoints are the ones in section 2.3 of EyeReal, extended to any distance.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from runtime.optics.views import stack_from_eye
 from runtime.records import F64
 
 USUAL = CalibrationSettings()  # R 40 to 60 cm, phi 70 to 90 degrees from the vertical, theta 80 to 100 degrees
-IPD_M = 0.060  # distance between the eyes in the paper, used if the configuration has no value
+IPD_M = 0.060  # the paper's distance between the eyes, used if the configuration has no value
 
 
 @dataclass(frozen=True, slots=True)
 class Viewpoint:
-    """Position at which a calibration needs the midpoint between the eyes, in spherical coordinates."""
+    """Position where a calibration needs the midpoint between the eyes, in spherical coordinates."""
 
-    radius_cm: int  # distance from the origin of the stack
+    radius_cm: int  # distance from the stack's origin
     phi_deg: int  # angle from the vertical
     theta_deg: int  # angle about the vertical; 90 degrees is in front of the display
 
@@ -32,29 +32,29 @@ class Viewpoint:
 
     @property
     def midpoint_m(self) -> F64:
-        """Position (3,) in the frame `stack`.
+        """Position (3,) in the `stack` frame.
 
         It is x = R sin(phi) sin(theta), y = R sin(phi) cos(theta), z = R cos(phi).
         """
         return spherical_m(self.radius_cm / 100, phi_deg=self.phi_deg, theta_deg=self.theta_deg)
 
     def eyes_m(self, ipd_m: float = IPD_M) -> F64:
-        """Return the positions (2, 3) of the left and the right eye in the frame `stack`.
+        """Return the left and right eyes' positions in the `stack` frame, as a (2, 3) array.
 
-        The line between the eyes is horizontal and perpendicular to the line of sight to the centre of the stack.
+        The line between the eyes is horizontal and perpendicular to the line of sight to the stack's centre.
         """
         right = stack_from_eye(self.midpoint_m)[:3, 0]
         return self.midpoint_m + np.outer([-ipd_m / 2, ipd_m / 2], right)
 
 
 def spherical_m(radius_m: float, *, phi_deg: float, theta_deg: float) -> F64:
-    """Convert a radius and the polar angles of the EyeReal supplement to a point (3,) in `stack`."""
+    """Convert a radius and the EyeReal supplement's polar angles to a point (3,) in `stack`."""
     phi, theta = np.radians(phi_deg), np.radians(theta_deg)
     return radius_m * np.array([np.sin(phi) * np.sin(theta), np.sin(phi) * np.cos(theta), np.cos(phi)])
 
 
 def viewing_place_m(viewing: CalibrationSettings) -> F64:
-    """Return the middle (3,) of the viewing range in `stack`, for which the panels are registered."""
+    """Return the middle (3,) of the viewing range in `stack`. The panels are registered for this point."""
     up_deg = sum(viewing.viewing_up_deg) / 2
     return spherical_m(sum(viewing.viewing_m) / 2, phi_deg=90 - up_deg, theta_deg=90)
 
@@ -62,7 +62,7 @@ def viewing_place_m(viewing: CalibrationSettings) -> F64:
 def grid(viewing: CalibrationSettings = USUAL) -> tuple[Viewpoint, ...]:
     """Return the 27 viewpoints of a viewing range, nearest first.
 
-    The default range has the viewpoints of EyeReal.
+    The default range gives EyeReal's viewpoints.
     """
     low_deg, high_deg = viewing.viewing_up_deg
     radii_cm = np.rint(100 * np.linspace(*viewing.viewing_m, 3)).astype(int)
@@ -72,7 +72,7 @@ def grid(viewing: CalibrationSettings = USUAL) -> tuple[Viewpoint, ...]:
 
 
 def viewing_volume_m(viewing: CalibrationSettings = USUAL) -> F64:
-    """Return points (125, 3) in the frame `stack` that span the space in which viewers move.
+    """Return points (125, 3) in the `stack` frame that span the viewers' range of movement.
 
     The volume is larger than the grid of viewpoints: it reaches from 0.75 times the nearest to 1.5 times the farthest
     distance, and 15 degrees farther to each side and 10 degrees farther up and down. By default it reaches from 0.3 to

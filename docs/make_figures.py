@@ -45,7 +45,7 @@ def box(axes: Any, x: float, y: float, width: float, height: float, text: str, c
 
 
 def blank(figure: Any, place: Any, x: tuple[float, float], y: tuple[float, float]) -> Any:
-    """Add axes without ticks and frame to a figure."""
+    """Add axes without ticks or a frame to a figure."""
     axes = figure.add_subplot(place)
     axes.set(xlim=x, ylim=y, xticks=[], yticks=[])
     axes.set_frame_on(False)
@@ -53,7 +53,7 @@ def blank(figure: Any, place: Any, x: tuple[float, float], y: tuple[float, float
 
 
 def optics() -> Figure:
-    """Draw the stack from above with the rays of both eyes, the layers, and the view of each eye."""
+    """Draw the stack from above with both eyes' rays, the layers, and each eye's view."""
     stack = StackGeometry().stack()
     eyes = eyes_at(distance_m=0.6, height_m=0.05)
     with PairPainter("room", stack) as painter:
@@ -101,7 +101,7 @@ def optics() -> Figure:
 
 
 def architecture() -> Figure:
-    """Draw a diagram of the threads and the data that they exchange."""
+    """Draw a diagram of the threads and the data they exchange."""
     figure = Figure(figsize=(11, 5.6), layout="constrained")
     axes = blank(figure, 111, (0, 22), (0, 11))
     threads = (
@@ -137,7 +137,7 @@ def architecture() -> Figure:
 
 
 def clocks() -> Figure:
-    """Draw the samples, solutions and refreshes over a fifth of a second."""
+    """Draw the samples, solutions and refreshes during a fifth of a second."""
     figure = Figure(figsize=(11, 3.6), layout="constrained")
     axes = blank(figure, 111, (-38, 205), (-0.7, 3.4))
     refresh_ms, solve_ms, first_ms = 1e3 / 60, 42.0, 18.0
@@ -168,7 +168,7 @@ def clocks() -> Figure:
 
 
 def draw_example() -> None:
-    """Render the pictures of `phasestack.example_pair`."""
+    """Render the pictures used by `phasestack.example_pair`."""
     stack = replace(StackGeometry().stack(), width_px=640, height_px=360)
     with PairPainter(SCENE, stack) as painter:
         pair = painter.pair(SCENE, np.array(EYES_M), stack, fov_deg=EXAMPLE_FOV_DEG, off_mm=())

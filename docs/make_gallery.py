@@ -1,6 +1,6 @@
-"""Write docs/performance.md and the documentation's pictures from a demo and a report.
+"""Write docs/performance.md and the documentation's pictures, based on a demo and a report.
 
-Run `make gallery`, which takes minutes, or
+Run `make gallery`, which takes several minutes, or
 
     python -m docs.make_gallery [--work FOLDER] [--keep] [REPORT OPTION ...]
 
@@ -49,8 +49,8 @@ from tests.calib.simulator import Camera, camera_from_stack, ideal_panel, photog
 DOCS = Path(__file__).resolve().parent
 IMAGES = DOCS / "images"
 WIDTH_PX, LIMIT_BYTES = 1200, 200_000
-FILM_BYTES, FILM_PX, FILM_EVERY = 1_500_000, (400, 225), 4  # size limit, size of a picture, refreshes per film frame
-FILM_S = 2.0, 8.0  # start and end of the film in the run
+FILM_BYTES, FILM_PX, FILM_EVERY = 1_500_000, (400, 225), 4  # size limit, picture size, refreshes per film frame
+FILM_S = 2.0, 8.0  # the film's start and end within the run
 PICTURES = {  # name in docs/images: path in the work folder
     "boards.jpg": "boards.png",
     "kinds.jpg": "kinds.png",
@@ -103,7 +103,7 @@ HEADINGS = ["method", "time, × fastest", "ms", "memory, MiB", "light 0 mm, dB",
 
 
 def page(report: dict[str, Any]) -> str:
-    """Format the text of docs/performance.md from the contents of report.json."""
+    """Format the text for docs/performance.md, based on the contents of report.json."""
     machine = report["machine"]
     facts = f"{machine['processor']}, {machine['cores']} cores, phasestack {machine['phasestack']}, {machine['date']}"
     methods = sorted(report["methods"], key=lambda method: method["ms_p50"])
@@ -149,9 +149,9 @@ def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def kinds(folder: Path) -> Image.Image:
-    """Draw a contact sheet of the runs of `examples/content.py`.
+    """Draw a contact sheet of the runs made by `examples/content.py`.
 
-    Each row shows the front layer, the views of both eyes, and the target of the left eye.
+    Each row shows the front layer, both eyes' views, and the left eye's target.
     """
     names = ("layer-2.png", "seen-left.png", "seen-right.png", "wanted-left.png")
     runs = sorted(path.parent for path in folder.glob(f"*/{names[0]}"))
@@ -175,7 +175,7 @@ def boards() -> Image.Image:
 
 
 def moving_text(found: Sequence[Moving]) -> str:
-    """Format the table of the motions, and name those for which `auto` is not the best effort."""
+    """Format the table of motions, and name any for which `auto` is not the best effort."""
     rows, worse = [], []
     for motion in dict.fromkeys(one.motion for one in found):
         own = {one.effort: one for one in found if one.motion == motion}
@@ -197,7 +197,7 @@ def _live(one: Moving) -> list[str]:
 
 
 def look_into(folder: Path) -> None:
-    """Write the files of a solution, whose `viewer.html` is shown in the documentation."""
+    """Write a solution's files. Its `viewer.html` is shown in the documentation."""
     stack = replace(StackGeometry().stack(), width_px=640, height_px=360)
     eyes = eyes_at(distance_m=0.65, angle_deg=4, height_m=0.08)
     with PairPainter("room", stack) as painter:
@@ -206,12 +206,12 @@ def look_into(folder: Path) -> None:
 
 
 class KeptInMemory:
-    """Output of a run that keeps the lines, the layers and the true pictures in memory."""
+    """Output for a run that keeps its lines, layers and true pictures in memory."""
 
     def __init__(self) -> None:
         self.lines: list[Mapping[str, Any]] = []  # lines of frames.jsonl
-        self.layers: dict[int, U8] = {}  # layers by the number of the refresh
-        self.true: dict[int, tuple[Mapping[str, Any], Pictures]] = {}  # entry of light.json and pictures by refresh
+        self.layers: dict[int, U8] = {}  # layers, keyed by refresh number
+        self.true: dict[int, tuple[Mapping[str, Any], Pictures]] = {}  # light.json entry and pictures, keyed by refresh
 
     def refresh(self, line: Mapping[str, Any]) -> None:
         self.lines.append(line)
@@ -225,9 +225,9 @@ class KeptInMemory:
 
 
 def leaning(folder: Path) -> None:
-    """Write the film `leaning.webp` of what the left eye of a leaning head sees.
+    """Write the film `leaning.webp`, which shows what a leaning head's left eye sees.
 
-    Each frame shows the full model, the effort `auto` and the true view.
+    Each frame shows the full model, the `auto` effort and the true view.
     """
     recording = folder / "lean.mcap"
     write_motion(recording, "lean", seconds=FILM_S[1], seed=SEED, noise_mm=NOISE_MM)
@@ -259,9 +259,9 @@ def leaning(folder: Path) -> None:
 
 
 def light_of(eye_m: F64, layers: U8, stack: PanelStack, *, fov_deg: float) -> U8:
-    """Compute the picture (h, w, 3) that an eye sees of the layers, averaged over the pupil.
+    """Compute the picture (h, w, 3) of the layers as seen by an eye, averaged over the pupil.
 
-    Rays that miss a panel are black. `eye_m` is the eye's position (3,) in the frame `stack`.
+    Rays that miss a panel are black. `eye_m` is the eye's position (3,) in the `stack` frame.
     """
     points = pupil_points(PUPIL_MM / 1000) @ stack_from_eye(eye_m)[:3, :2].T
     seen = average(
@@ -274,7 +274,7 @@ def light_of(eye_m: F64, layers: U8, stack: PanelStack, *, fov_deg: float) -> U8
 
 
 def save_film(frames: Sequence[Image.Image], path: Path, *, period_ms: float) -> None:
-    """Write an animated WebP with the best quality that the size limit permits.
+    """Write an animated WebP at the best quality that the size limit permits.
 
     Raises SystemExit if the file is too large even at the lowest quality.
     """
@@ -292,7 +292,7 @@ def _label(sheet: Image.Image, place: tuple[int, int], text: str) -> None:
 
 
 def smaller(source: Path, name: str) -> bytes:
-    """Reduce a picture to the width of the pages and return the JPEG or PNG file, depending on the name.
+    """Reduce a picture to the pages' width, and return it as a JPEG or PNG file, depending on the name.
 
     Raises SystemExit if the file is too large even at the lowest quality.
     """

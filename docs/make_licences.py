@@ -1,7 +1,7 @@
-"""Write THIRD_PARTY.md, which lists the packages of the runtime and their licences.
+"""Write THIRD_PARTY.md, which lists the runtime's packages and their licences.
 
-Run it in the environment of `make test`. The packages are those in requirements/runtime.lock, and pip-licenses reads
-their metadata.
+Run it in the environment used by `make test`. The packages are those listed in requirements/runtime.lock; their
+metadata is read by pip-licenses.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ libusb (LGPL-2.1) and OpenNI2 (Apache-2.0).
 
 
 def locked() -> dict[str, str]:
-    """Return the versions of the runtime's packages by name."""
+    """Return the versions of the runtime's packages, keyed by name."""
     text = (ROOT / "requirements" / "runtime.lock").read_text(encoding="utf-8")
     return dict(re.findall(r"^([A-Za-z0-9._-]+)==([^ \\\n]+)", text, re.MULTILINE))
 
 
 def licences(names: list[str]) -> list[dict[str, str]]:
-    """Return the entries `Name`, `Version`, `License` and `URL` of installed packages, sorted by name."""
+    """Return installed packages' `Name`, `Version`, `License` and `URL` entries, sorted by name."""
     command = [
         Path(sys.executable).parent / "pip-licenses",
         "--from=mixed",

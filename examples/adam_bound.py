@@ -1,8 +1,8 @@
-"""Estimate the best quality that panels can reach for a pair, by solver steps and then by Adam.
+"""Estimate the best quality that panels can reach for a pair, with solver steps and then with Adam.
 
-Adam minimises the squared error of random rays through square pixels, with new rays in every iteration. If it used the
-model of light (`light`) instead, the result would be worse than that of the steps, because Adam finds panels for which
-the model is wrong by up to 2 dB at 44 dB.
+Adam minimises the squared error over random rays through square pixels, with new rays in every iteration. If it used
+the light model (`light`) instead, the result would be worse than the solver steps' result, because Adam finds panels
+for which the model is wrong by up to 2 dB at 44 dB.
 
 python examples/adam_bound.py left.png right.png --panels panels.json --left-eye 0.6 -0.03 0 --right-eye 0.6 0.03 0
 """
@@ -61,7 +61,7 @@ def main() -> None:
 
 
 def shown(method: str, number: int, panels: torch.Tensor, targets: torch.Tensor, views: Views) -> None:
-    """Print a line of the table with the light PSNR of the panels, rounded to 8 bits."""
+    """Print a table row with the light PSNR of the panels rounded to 8 bits."""
     print(f"{method}, {number}, {light_db((panels * 255).round() / 255, targets, views):.2f}")
 
 

@@ -1,10 +1,10 @@
-"""Create a scene of each kind of content and run it.
+"""Create a scene with each kind of content and run it.
 
 The output contains the layers, the eyes' views and a contact sheet.
 
     python examples/content.py gltf --out out/content        # one kind; by default, all kinds are run
 
-The file of the scene is kept next to the pictures of the run, and can be shown on a display:
+The scene's file is kept next to the run's pictures, and can be shown on a display:
 
     phasestack run --scene out/content/gltf/ring.glb
 """
@@ -21,16 +21,16 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
-Made = tuple[str, str]  # value of `scene` and further lines of the table [content]
+Made = tuple[str, str]  # value of `scene`, and further lines for the [content] table
 
 
 def ball_and_ground(width: int, height: int, eye_x: float = 0.0) -> tuple[Image.Image, Image.Image]:
-    """Draw a ball and bars in front of a background, and a depth map in which white is nearest.
+    """Draw a ball and bars in front of a background, and a depth map where white is nearest.
 
     Args:
-        width: Width of the pictures.
-        height: Height of the pictures.
-        eye_x: Shift of the ball in pixels for another view; nearer parts of the scene shift more.
+        width: Picture width.
+        height: Picture height.
+        eye_x: The ball's shift in pixels, used to draw another view; nearer parts of the scene shift more.
     """
     colour, depth = Image.new("RGB", (width, height), (235, 225, 205)), Image.new("L", (width, height), 50)
     pen, deep = ImageDraw.Draw(colour), ImageDraw.Draw(depth)
@@ -69,12 +69,12 @@ def side_by_side(folder: Path, *, half: bool = False) -> Made:
 
 
 def half_side_by_side(folder: Path) -> Made:
-    """Write two views side by side that are compressed to half the columns."""
+    """Write two views side by side, compressed to half the columns."""
     return side_by_side(folder, half=True)
 
 
 def quilt(folder: Path) -> Made:
-    """Write a quilt: the views of 24 cameras in one picture."""
+    """Write a quilt: the views from 24 cameras in one picture."""
     columns, rows, wide, high = 8, 3, 240, 135
     sheet = Image.new("RGB", (columns * wide, rows * high))
     for number in range(columns * rows):
@@ -108,7 +108,7 @@ def film(folder: Path) -> Made:
 
 
 def mesh(folder: Path, suffix: str) -> Made:
-    """Write a mesh of two coloured shapes in the format of the suffix."""
+    """Write a mesh of two coloured shapes, in the format given by the suffix."""
     import trimesh
 
     parts = [trimesh.creation.torus(1.0, 0.35), trimesh.creation.icosphere(subdivisions=3, radius=0.5)]
@@ -131,7 +131,7 @@ def stl(folder: Path) -> Made:
 
 
 def splats(folder: Path) -> Made:
-    """Write a ring of Gaussian splats as a PLY file in the format of the reference implementation."""
+    """Write a ring of Gaussian splats as a PLY file in the reference implementation's format."""
     rng = np.random.default_rng(0)
     count = 4000
     u, v = rng.random((2, count)) * 2 * np.pi
@@ -168,7 +168,7 @@ def playlist(folder: Path) -> Made:
 
 
 def data_set(folder: Path) -> Made:
-    """Write a pair with the file names of the published data set, in a folder named after a scene."""
+    """Write a pair with file names as in the published data set, in a folder named after a scene."""
     pairs = folder / "lego_bulldozer"
     pairs.mkdir(exist_ok=True)
     for half, y, shift in ((1, -0.263, -20), (0, 0.237, 20)):
@@ -177,7 +177,7 @@ def data_set(folder: Path) -> Made:
 
 
 def placed(folder: Path) -> Made:
-    """Show the demo scene reduced in size, moved, and rotating."""
+    """Show the demo scene at a reduced size, moved and rotating."""
     return "demo", "scale = 0.8\noffset_m = [0.02, 0.0, 0.01]\nturntable_per_min = 10"
 
 
@@ -189,7 +189,7 @@ KINDS: dict[str, Callable[[Path], Made]] = {
 
 
 def main() -> int:
-    """Create and run the scenes that the command line selects."""
+    """Create and run the scenes selected on the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("kind", nargs="*", choices=[*KINDS, []], help="kinds to run; default: all")
     parser.add_argument(

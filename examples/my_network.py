@@ -1,4 +1,4 @@
-"""Custom network: a small U-Net that computes three panels from two pictures.
+"""A custom network: a small U-Net that computes three panels from two pictures.
 
 The file must be on Python's path:
 
@@ -7,9 +7,9 @@ The file must be on Python's path:
     phasestack export --arch my_network:MyNetwork --checkpoint out/mine/checkpoint.pth --out mine.onnx
     phasestack solve --model mine.onnx ...
 
-The input (batch, 6, height, width) is the pictures for both eyes, resampled to the pixels of the centre panel, as
-intensities from 0 to 1 with the left eye first. The output (batch, 9, height, width) is the panel values from 0 to 1,
-with the rear panel first.
+The input (batch, 6, height, width) holds both eyes' pictures, resampled to the centre panel's pixels, as intensities
+from 0 to 1 with the left eye first. The output (batch, 9, height, width) holds the panel values from 0 to 1, with the
+rear panel first.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from torch.nn import functional
 class MyNetwork(nn.Module):
     """U-Net that predicts how each panel deviates from an equal share of the mean picture.
 
-    It works at half the resolution of the panels: blocks of 2 by 2 pixels become channels.
+    It works at half the panels' resolution: blocks of 2 by 2 pixels become channels.
     """
 
-    input_frame = "centre"  # alternative: "panel", with the pictures on the pixels of every panel (18 channels)
+    input_frame = "centre"  # alternative: "panel", the pictures resampled to every panel's pixels (18 channels)
     input_value = "intensity"  # alternative: "phase", the sum of panel values that shows the intensity
 
     class Options(BaseModel):
-        """Options of the network, which `--option` sets.
+        """The network's options, set with `--option`.
 
         They are validated, passed to `__init__` and stored in the checkpoint.
         """

@@ -1,7 +1,8 @@
-"""Program that draws a turning cube for the display with moderngl.
+"""A program that draws a turning cube for the display with moderngl.
 
 It requires `pip install moderngl websockets numpy`. Start `phasestack try --scene program` (or `run`), and then
-`python examples/program.py ADDRESS`. `phasestack status` and the page of `try` show the address as `program`.
+`python examples/program.py ADDRESS`. The address is shown as `program` by `phasestack status` and on the page opened by
+`try`.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ FRAGMENT = "#version 330\nin vec3 colour; out vec4 seen; void main() { seen = ve
 
 
 def cube() -> np.ndarray:
-    """Return the corners (36, 3) of the cube's 12 triangles.
+    """Return the corners of the cube's 12 triangles, as a (36, 3) array.
 
     They are in metres, with x out of the screen, y to the viewer's right and z up.
     """

@@ -1,4 +1,4 @@
-"""Custom scene: a tunnel behind the display, which is drawn with NumPy alone.
+"""A custom scene: a tunnel behind the display, drawn with NumPy alone.
 
 The file must be on Python's path, and the configuration must name the class:
 
@@ -8,7 +8,7 @@ The file must be on Python's path, and the configuration must name the class:
 
     PYTHONPATH=examples phasestack run --config tunnel.toml --replay demo --headless --max-speed --frames 60 --out out
 
-Coordinates are in metres from the centre of the display, with x out of the screen, y to the right and z up.
+Coordinates are in metres from the display's centre, with x out of the screen, y to the right and z up.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from pydantic import BaseModel, Field
 
 import phasestack
 
-RING_M = 0.04  # length of a ring of tiles
+RING_M = 0.04  # length of each ring of tiles
 TILES = 16  # number of tiles in a ring
-DARK_AFTER_M = 0.5  # depth over which the brightness falls by the factor e
+DARK_AFTER_M = 0.5  # depth over which the brightness falls by a factor of e
 
 
 class TunnelOptions(BaseModel):
-    """Options of the scene in the table [content.options]."""
+    """The scene's options, from the [content.options] table."""
 
     radius_m: float = Field(0.12, gt=0.02, lt=1.0)
     speed_m_per_s: float = 0.05
 
 
 class Tunnel(phasestack.ContentSource):
-    """Tiled tube around the axis of the display, which moves towards the viewer."""
+    """A tiled tube around the display's axis that moves towards the viewer."""
 
     Options = TunnelOptions
 
@@ -42,10 +42,10 @@ class Tunnel(phasestack.ContentSource):
         self._options = options
 
     def render(self, view: Any, *, time_ns: int) -> np.ndarray:
-        """Draw the picture of an eye by intersecting the ray through each pixel with the tube."""
+        """Draw an eye's picture by intersecting the ray through each pixel with the tube."""
         u, v = np.meshgrid(np.arange(view.width_px) + 0.5, np.arange(view.height_px) + 0.5)
         rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(view.pixels_from_stack[:, :3]).T
-        # Solve for the t at which eye + t·ray reaches the wall. The larger of the two solutions is ahead of the eye.
+        # Find t such that eye + t·ray lies on the wall. The larger of the two solutions is ahead of the eye.
         across, eye = rays[..., 1:], view.eye_m[1:]
         a, b = (across**2).sum(-1), across @ eye
         c = eye @ eye - self._options.radius_m**2

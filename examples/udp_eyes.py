@@ -1,4 +1,4 @@
-"""Custom sensor that receives eye positions as JSON over UDP.
+"""A custom sensor that receives eye positions as JSON over UDP.
 
 The file must be on Python's path, and the configuration must name the class:
 
@@ -8,9 +8,9 @@ The file must be on Python's path, and the configuration must name the class:
 
     PYTHONPATH=examples phasestack run --config udp.toml --headless --out out/udp
 
-A datagram is `{"n": 1, "t_ns": 0, "left": [x, y, z], "right": [x, y, z]}`. It contains a counter, the sender's time and
-the positions of the viewer's left and right eye in metres. The sensor's frame has x to the sensor's right, y down and
-z away from the sensor.
+Each datagram is of the form `{"n": 1, "t_ns": 0, "left": [x, y, z], "right": [x, y, z]}`. It contains a counter, the
+sender's time and the positions of the viewer's left and right eyes in metres. The sensor's frame has x to the sensor's
+right, y down and z away from the sensor.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from phasestack import Capabilities, DeviceClock, EyePoints, Sensor, SensorFrame
 
 
 class UdpOptions(BaseModel):
-    """Options of the sensor in the table [sensor.options]."""
+    """The sensor's options, from the [sensor.options] table."""
 
     port: int = Field(ge=1, le=65535)
     noise_mm: tuple[float, float, float] = (0.5, 0.5, 2.0)  # standard deviations along x, y and z

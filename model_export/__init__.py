@@ -1,1 +1,1 @@
-"""Definition and training of networks, and their export to ONNX. Only this package requires torch."""
+"""Define networks, train them and export them to ONNX. Only this package requires torch."""

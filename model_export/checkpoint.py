@@ -1,4 +1,4 @@
-"""Read and write checkpoints. Only weights are read, which prevents a checkpoint from running code."""
+"""Read and write checkpoints. Only weights are read, so that a checkpoint cannot run code."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ WIDTH_KEY = "subnets.in_conv.0.weight"
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
-    """Read a checkpoint: a dictionary whose entry `model` is a state dictionary of tensors.
+    """Read a checkpoint: a dictionary whose `model` entry is a state dictionary of tensors.
 
-    Only plain values, tensors and an `argparse.Namespace` of plain values are deserialised. The published code saves
-    such a namespace.
+    Only plain values, tensors and an `argparse.Namespace` of plain values (which the published code saves) are
+    deserialised.
 
     Raises:
-        InputError: The file cannot be read, contains other objects, or has no entry `model`.
+        InputError: The file cannot be read, contains other objects, or has no `model` entry.
     """
     data = untrusted_input.read_bytes(path, most_bytes=FILE_BYTES_MAX)
     try:
@@ -41,9 +41,9 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def eyereal_width(state: Mapping[str, Tensor], *, source: Path) -> int:
-    """Return the number of channels of the first layer, from the weights of a published network.
+    """Return the number of channels in a published network's first layer, as read from its weights.
 
-    Raises InputError if the weights are not those of the published network.
+    Raises InputError if the weights do not belong to the published network.
     """
     first = state.get(WIDTH_KEY)
     if first is None or first.ndim != 4:
@@ -56,9 +56,9 @@ def fill(net: nn.Module, state: Mapping[str, Tensor], *, source: str | Path, arc
 
     Args:
         net: Network to modify.
-        state: Weights by name.
-        source: File of the weights, for error messages.
-        arch: Name of the network, for error messages.
+        state: Weights, keyed by name.
+        source: File the weights come from, used in error messages.
+        arch: Name of the network, used in error messages.
 
     Raises:
         InputError: A weight is missing, unknown, of the wrong shape or not finite. The message names the weight.

@@ -1,4 +1,4 @@
-"""Commands `phasestack train`, `export` and `validate`. Torch is imported only when they run."""
+"""The commands `phasestack train`, `export` and `validate`. Torch is imported only when they run."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def train(
     resume: Annotated[bool, typer.Option("--resume", help="continue from the checkpoint in --out")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="the result as one object on stdout")] = False,
 ) -> None:
-    """Train a picture network by gradient descent on the light at the eyes.
+    """Train a picture network by gradient descent on the light that reaches the eyes.
 
     Example: phasestack train --arch my_network:MyNetwork --out out/mine
     """
@@ -87,9 +87,9 @@ def train(
 
 
 def options_of(texts: list[str] | None) -> dict[str, Any]:
-    """Parse options of the form NAME=VALUE, where a value that is not JSON is text.
+    """Parse options of the form NAME=VALUE. Values that are not JSON are taken as text.
 
-    Raises InputError if an option has another form.
+    Raises InputError if an option has a different form.
     """
     options: dict[str, Any] = {}
     for text in texts or []:
@@ -119,7 +119,7 @@ def export(
     option: Options = None,
     as_json: Annotated[bool, typer.Option("--json", help="the checks as one object on stdout")] = False,
 ) -> None:
-    """Write a model and its contract as an ONNX file, if its results agree with those of torch.
+    """Write a model and its contract to an ONNX file, provided that its results agree with torch's.
 
     fast, balanced and best are built from their recipes, without --checkpoint or --random-init. Exits with 1 if a check
     fails.
@@ -149,7 +149,7 @@ def validate(
     file: Annotated[Path, typer.Argument(help="the ONNX file")],
     as_json: Annotated[bool, typer.Option("--json", help="the checks as one object on stdout")] = False,
 ) -> None:
-    """Check the contract of a model file, its names and shapes, and its results for extreme inputs.
+    """Check a model file's contract, names and shapes, and its results for extreme inputs.
 
     Exits with 1 if a check fails.
 

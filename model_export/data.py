@@ -1,4 +1,4 @@
-"""Generate random training pairs: pictures of textured planes, seen from random eye positions."""
+"""Generate random training pairs: pictures of textured planes as seen from random eye positions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack, stack_from_eye
 from runtime.records import F64, U8
 
-PITCH_WIDTH_M = 0.5184  # width of the prototype panels
+PITCH_WIDTH_M = 0.5184  # the prototype panels' width
 CENTRE = 1  # index of the middle panel of three
 WIDEST_DEG = 100.0  # largest horizontal field of view of a training picture
 LEAST_COMMON = 0.4  # share of the middle panel's width and height that each eye must see through all panels
@@ -20,7 +20,7 @@ LEAST_COMMON = 0.4  # share of the middle panel's width and height that each eye
 
 @dataclass(frozen=True, slots=True)
 class TrainingPair:
-    """Pair of pictures with the panels and the eye positions for which they were rendered."""
+    """A pair of pictures, with the panels and the eye positions that they were rendered for."""
 
     stack: PanelStack
     eyes_m: F64  # (2, 3) left and right eye, frame `stack`
@@ -29,7 +29,7 @@ class TrainingPair:
 
 
 def random_stack(random: Random, *, width_px: int, height_px: int) -> PanelStack:
-    """Return three evenly spaced panels with a random width and a random gap."""
+    """Return three evenly spaced panels of random width, with a random gap between them."""
     width_m = PITCH_WIDTH_M * math.exp(random.uniform(math.log(0.25), math.log(1.6)))
     gap_m = math.exp(random.uniform(math.log(0.005), math.log(0.5)))
     if random.random() < 0.6:  # most stacks have a practical gap
@@ -38,7 +38,7 @@ def random_stack(random: Random, *, width_px: int, height_px: int) -> PanelStack
 
 
 def random_eyes(random: Random, stack: PanelStack) -> F64:
-    """Return random positions (2, 3) of the left and the right eye in the frame `stack`.
+    """Return random left and right eye positions in the `stack` frame, as a (2, 3) array.
 
     The head is 0.1 to 4 m from the origin and at least 0.1 m in front of the panels, and may be rolled and turned.
     """
@@ -64,8 +64,8 @@ def is_served(eyes_m: F64, stack: PanelStack) -> bool:
     """Return True if each eye sees at least `LEAST_COMMON` of the middle panel through all panels.
 
     Args:
-        eyes_m: Positions (2, 3) of the eyes in the frame `stack`.
-        stack: Geometry of three panels.
+        eyes_m: The eyes' positions (2, 3) in the `stack` frame.
+        stack: Geometry of the three panels.
     """
     for eye in eyes_m:
         edges = []
@@ -84,9 +84,9 @@ def is_served(eyes_m: F64, stack: PanelStack) -> bool:
 def random_place(
     random: Random, *, width_px: int, height_px: int, stack: PanelStack | None = None
 ) -> tuple[PanelStack, F64]:
-    """Return panels and random eye positions (2, 3) from which enough of the panels is visible.
+    """Return panels, and random eye positions (2, 3) with enough of the panels in view.
 
-    The panels are `stack` or, if it is None, random panels of the given size in pixels.
+    The panels are `stack` or, if that is None, random panels of the given size in pixels.
     """
     while True:
         panels = stack or random_stack(random, width_px=width_px, height_px=height_px)
@@ -98,14 +98,14 @@ def random_place(
 def random_pair(
     random: Random, *, width_px: int, height_px: int, stack: PanelStack | None = None, fov_deg: float = 0.0
 ) -> TrainingPair:
-    """Draw a random scene for random eye positions.
+    """Draw a random scene as seen from random eye positions.
 
     Args:
         random: Source of all random numbers.
-        width_px: Width of the pictures and of random panels.
-        height_px: Height of the pictures and of random panels.
-        stack: Geometry of the panels, or None for random panels.
-        fov_deg: Horizontal field of view of the pictures, or 0 for pictures as wide as the panels.
+        width_px: Width of the pictures and of any random panels.
+        height_px: Height of the pictures and of any random panels.
+        stack: Panel geometry, or None for random panels.
+        fov_deg: The pictures' horizontal field of view, or 0 for pictures as wide as the panels.
     """
     stack, eyes = random_place(random, width_px=width_px, height_px=height_px, stack=stack)
     scene = random_scene(random, stack, eyes.mean(axis=0))
@@ -116,6 +116,6 @@ def random_pair(
 
 
 def filling_fov_deg(stack: PanelStack, eye_m: F64) -> float:
-    """Return the angle that the panels' width fills at an eye's distance, at most `WIDEST_DEG`."""
+    """Return the angle subtended by the panels' width at an eye's distance, at most `WIDEST_DEG`."""
     distance_m = float(np.linalg.norm(eye_m))
     return min(WIDEST_DEG, math.degrees(2 * math.atan(stack.width_m / 2 / distance_m)))

@@ -1,4 +1,4 @@
-"""Export a model as an ONNX file and check it (`phasestack export`)."""
+"""Export a model to an ONNX file and check the file (`phasestack export`)."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ def export_model(
     Args:
         arch: Name of a shipped model or a picture network, or `module:Class`.
         out: ONNX file to write.
-        checkpoint: Weights of a picture network.
-        random_init: Seed of random weights, instead of a checkpoint.
-        width_px: Width of the pictures of a picture network, even.
-        height_px: Height of the pictures of a picture network, even.
-        eye_order: Order of the eyes in the input of a picture network.
-        options: Arguments of the picture network's class.
+        checkpoint: File with a picture network's weights.
+        random_init: Seed for random weights, used instead of a checkpoint.
+        width_px: Width of a picture network's pictures; must be even.
+        height_px: Height of a picture network's pictures; must be even.
+        eye_order: Order of the eyes in a picture network's input.
+        options: Arguments for the picture network's class.
 
     Returns:
         The results of the checks.
@@ -82,7 +82,7 @@ def export_model(
 
 
 def in_torch(module: nn.Module) -> Reference:
-    """Wrap a torch module as the reference with which the results of its ONNX file are compared."""
+    """Wrap a torch module for use as the reference that its ONNX file's results are compared with."""
 
     def run(feeds: Feeds) -> Sequence[np.ndarray]:
         with torch.no_grad():
@@ -96,7 +96,7 @@ def spectral_model(name: str) -> tuple[bytes, nn.Module]:
     """Build a shipped model from its recipe.
 
     Returns:
-        The ONNX file, which contains the contract, and the torch module.
+        The ONNX file, including the contract, and the torch module.
     """
     recipe = read_recipe(name)
     net = SpectralSolver(recipe.cell_px).eval()
@@ -132,9 +132,9 @@ def picture_network(
 
     Args:
         arch: Name of the network, or `module:Class`.
-        checkpoint: File of the weights, or None. A checkpoint of `phasestack train` contains the network's options.
-        random_init: Seed of random weights if there is no checkpoint.
-        options: Arguments of the network's class, which override those in the checkpoint.
+        checkpoint: File with the weights, or None. A checkpoint from `phasestack train` contains the network's options.
+        random_init: Seed for random weights, used if there is no checkpoint.
+        options: Arguments for the network's class. They override those in the checkpoint.
 
     Returns:
         The network and a SHA-256 that identifies its weights.
@@ -164,14 +164,14 @@ def picture_network(
 def picture_file(
     network: Network, origin: str, *, width_px: int, height_px: int, eye_order: EyeOrder = "left-right"
 ) -> bytes:
-    """Export a picture network as an ONNX file for pictures of one size.
+    """Export a picture network to an ONNX file for pictures of one size.
 
     Args:
         network: Network to export.
-        origin: SHA-256 that identifies the weights, for the contract.
-        width_px: Width of the pictures.
-        height_px: Height of the pictures.
-        eye_order: Order of the eyes in the input, for the contract.
+        origin: SHA-256 that identifies the weights, stored in the contract.
+        width_px: Picture width.
+        height_px: Picture height.
+        eye_order: Order of the eyes in the input, stored in the contract.
 
     Raises:
         InputError: The network fails for pictures of this size, or torch cannot export it.

@@ -1,4 +1,4 @@
-"""EyeReal's published U-Net, with the parameter names of the published checkpoints."""
+"""EyeReal's published U-Net, with the parameter names used in the published checkpoints."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from runtime.config import Section
 
-PICTURE_FOV_DEG = 40.0  # horizontal field of view outside which the published code makes the input black
+PICTURE_FOV_DEG = 40.0  # horizontal field of view; outside it, the published code makes the input black
 OFFSET = 0.2  # the published code shows sigmoid(y) - 0.2, and the panel clips negative values
 INPUT, OUTPUT = "eyes", "panels"
 LEAST_PX = 32  # minimum width and height, because the network halves them five times
@@ -30,10 +30,10 @@ def _block(channels: int, middle: int, out: int) -> nn.Sequential:
 
 
 class Up(nn.Module):
-    """Decoder stage of the U-Net.
+    """A decoder stage of the U-Net.
 
-    It doubles the size of its input (bilinear, aligned corners), pads the result to the size of the skip connection,
-    concatenates both and applies two convolutions.
+    It doubles its input's size (bilinear, aligned corners), pads the result to the skip connection's size, concatenates
+    the two and applies two convolutions.
     """
 
     def __init__(self, channels: int, out: int) -> None:
@@ -41,7 +41,7 @@ class Up(nn.Module):
         self.conv = _block(channels, channels // 2, out)
 
     def forward(self, deep: Tensor, skip: Tensor) -> Tensor:
-        """Combine features (n, a, h, w) and a skip connection (n, b, H, W) to features (n, out, H, W)."""
+        """Combine features (n, a, h, w) and a skip connection (n, b, H, W) into features (n, out, H, W)."""
         up = functional.interpolate(deep, scale_factor=2, mode="bilinear", align_corners=True)
         rows, columns = skip.shape[2] - up.shape[2], skip.shape[3] - up.shape[3]
         up = functional.pad(up, [columns // 2, columns - columns // 2, rows // 2, rows - rows // 2])
@@ -50,7 +50,7 @@ class Up(nn.Module):
 
 
 class UNet(nn.Module):
-    """U-Net with five levels, which is the module `subnets` of the published network.
+    """U-Net with five levels; the published network's `subnets` module.
 
     It has 17,303,721 parameters at width 32 and 4,329,561 at width 16.
     """
@@ -81,7 +81,7 @@ class UNet(nn.Module):
 
 
 class EyeRealNet(nn.Module):
-    """Published network that maps the eyes' pictures, resampled for every panel, to panel values.
+    """The published network, which maps the eyes' pictures, resampled for every panel, to panel values.
 
     The input channels are intensities in [0, 1], ordered by panel, then eye, then RGB. The output channels are ordered
     by panel, then RGB. The outputs are in [-0.2, 0.8], as in the published code, and the panel clips negative values.
@@ -91,7 +91,7 @@ class EyeRealNet(nn.Module):
     picture_fov_deg = PICTURE_FOV_DEG
 
     class Options(Section):
-        """Size of the network."""
+        """The network's size."""
 
         width: Annotated[int, Field(ge=1, le=256)] = Field(32, description="number of channels of its first layer")
 

@@ -1,30 +1,30 @@
-"""Compute the light at the eyes, and steps of the solver, as differentiable functions in torch.
+"""Compute the light at the eyes, and the solver's steps, as differentiable torch functions.
 
-The runtime's kernels are tested against this reference implementation, and networks are trained through it. The
-equations are those of docs/mathematics.md, "A step".
+The runtime's kernels are tested against this reference implementation, and networks are trained by backpropagating
+through it. The equations are the ones in docs/mathematics.md, "A step".
 
 *Light.* Panel n shows x_n in [0, 1]. Along a ray, s is the sum of x_n, and the intensity is I = sin²(pi/2·s) =
-(1 - Re exp(i·pi·s))/2. A pixel of an eye's picture is a bundle of rays. Within a bundle, the values of different panels
+(1 - Re exp(i·pi·s))/2. A pixel of an eye's picture is a bundle of rays. Within a bundle, the values on different panels
 are nearly independent. Therefore
 
     E[exp(i·pi·s)] = Z = prod_n z_n,   z_n = sum_q w_nq·exp(i·pi·x_nq)                                        (L1)
     I = (1 - Re Z)/2                                                                                          (L2)
 
-where w_nq is the share of the bundle that pixel q covers on panel n. The shares are bilinear weights if the bundle is
-as wide as a pixel.
+where w_nq is the share of the bundle covered by pixel q on panel n. The shares are bilinear weights if the bundle is as
+wide as a pixel.
 
-*A step.* Let T be the target and e = I - T the residual, which is 0 if a ray misses a panel. Consider a common change
-of all pixels of a panel that a bundle crosses. The derivative of the squared error, and a bound on its curvature, are
-sums over all sets of rays:
+*A step.* Let T be the target and e = I - T the residual, which is 0 if a ray misses a panel. Consider changing, by the
+same amount, all of a panel's pixels that a bundle crosses. The derivative of the squared error, and a bound on its
+curvature, are then sums over all sets of rays:
 
     g_q = sum w·e·Im Z            (pi/2·g is the derivative of sum e²/2)                                      (L3)
     D_q = sum w·(Im Z)²                                                                                       (L4)
     x' = clip(y - size·2/(pi·N)·g/max(D, floor·E), 0, 1),     y' = x' + momentum·(x' - x)                   (L5)
 
 for N panels and E sets of rays. The sum over the rays through a panel's pixel is the transpose of bilinear sampling. It
-is approximated by one bilinear sample of the rays' values through the inverse homography. The approximation is exact
-if the pixels of the picture and of the panel have equal size. Otherwise g and D have a common wrong factor, which
-cancels. The edge pixels of a picture are extended outwards by two pixels.
+is approximated by one bilinear sample of the rays' values through the inverse homography. The approximation is exact if
+the picture's pixels and the panel's pixels have the same size. Otherwise, g and D are off by the same factor, which
+cancels out. The edge pixels of a picture are extended outwards by two pixels.
 """
 
 from __future__ import annotations
@@ -47,18 +47,18 @@ from runtime.optics.rpu import panel_from_image
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack
 
-NEAR_PX = 0.5  # distance from the edge of every panel beyond which a ray is valid
-SIZE = 0.8  # size of the steps after a trained network; larger steps overshoot from poor initial values
+NEAR_PX = 0.5  # a valid ray passes at least this far inside every panel's edges
+SIZE = 0.8  # size of the steps that follow a trained network; larger steps overshoot when the initial values are poor
 MOMENTUM, FLOOR = 0.7, 0.1
 LEAST_ERROR = 1e-6  # minimum squared error, which limits the PSNR to 60 dB
 
 
 @dataclass(frozen=True, slots=True)
 class Views:
-    """Rays of both eyes through the pixels of a raster, as homographies to the panels.
+    """Both eyes' rays through the pixels of a raster, as homographies to the panels.
 
     Each of the E sets of rays belongs to one eye. The sets alternate between the left and the right eye, and each pair
-    of sets belongs to one position of the head.
+    of sets belongs to one head position.
     """
 
     panels_from_rays: Tensor  # (E, N, 3, 3) float64, from raster to panel pixels; pixel centres at half-integers
@@ -76,19 +76,19 @@ class Views:
         fov_deg: float | None,
         places_m: ArrayLike = ((0.0, 0.0, 0.0),),
     ) -> Views:
-        """Create the rays through the pixels of the eyes' pictures or of the middle panel.
+        """Create the rays through the pixels of either the eyes' pictures or the middle panel.
 
         Args:
-            stack: Geometry of the panels.
-            eyes_m: Positions (2, 3) of the left and the right eye in the frame `stack`.
-            width_px: Width of the raster.
-            height_px: Height of the raster.
-            fov_deg: Horizontal field of view of the pictures, or None for the raster of the middle panel.
-            places_m: Displacements (P, 3) of both eyes. Each displacement adds two sets of rays, which pass through
-                the same points of the middle panel.
+            stack: Panel geometry.
+            eyes_m: Left and right eye positions (2, 3) in the `stack` frame.
+            width_px: Raster width.
+            height_px: Raster height.
+            fov_deg: The pictures' horizontal field of view, or None for the middle panel's raster.
+            places_m: Displacements (P, 3) of both eyes. Each displacement adds two sets of rays, which pass through the
+                same points on the middle panel.
 
         Raises:
-            ValueError: An eye is in the plane of the middle panel.
+            ValueError: An eye is in the middle panel's plane.
         """
         sets = []
         for place in np.asarray(places_m, np.float64):
@@ -102,15 +102,15 @@ class Views:
 
 
 def light(panels: Tensor, views: Views) -> tuple[Tensor, Tensor]:
-    """Compute the intensities at the eyes by (L1) and (L2).
+    """Compute the intensities at the eyes from (L1) and (L2).
 
     Args:
         panels: Panel values (N, C, H, W) in [0, 1].
-        views: Rays of the eyes.
+        views: The eyes' rays.
 
     Returns:
-        The intensities (E, C, h, w), which are differentiable with respect to the panels, and a mask (E, 1, h, w) of
-        the rays that cross all panels.
+        The intensities (E, C, h, w), differentiable with respect to the panels, and a mask (E, 1, h, w) of the rays
+        that cross all panels.
     """
     bundles, counts = _bundles(panels, views)
     return torch.stack([(1 - reduce(torch.mul, z).real) / 2 for z in bundles]), counts
@@ -123,10 +123,10 @@ def traced(
 
     Args:
         panels: Panel values (N, C, H, W) in [0, 1].
-        views: Rays of the eyes.
+        views: The eyes' rays.
         rays: Number of rays across and down a pixel. The pixel is divided into rays² equal parts, and each ray is at a
             random position in one part.
-        random: Source of the random positions.
+        random: Source of random positions.
 
     Returns:
         The intensities (E, C, h, w), and a mask (E, 1, h, w) of the pixels whose rays all cross all panels.
@@ -146,17 +146,17 @@ def traced(
 def light_db(
     panels: Tensor, targets: Tensor, views: Views, *, rays: int = 3, random: torch.Generator | None = None
 ) -> float:
-    """Return the PSNR in dB of the light at pinhole eyes.
+    """Return the PSNR, in dB, of the light at pinhole eyes.
 
-    The error is estimated twice with independent rays. The mean of the product of the two estimates is the squared
-    error without bias.
+    The error is estimated twice, with independent rays. The mean product of the two estimates is an unbiased estimate
+    of the squared error.
 
     Args:
         panels: Panel values (N, C, H, W) in [0, 1].
         targets: Target intensities (E, C, h, w).
-        views: Rays of the eyes.
+        views: The eyes' rays.
         rays: Number of rays across and down a pixel in each of the two estimates.
-        random: Source of the random positions.
+        random: Source of random positions.
     """
     (a, in_a), (b, in_b) = (traced(panels, views, rays=rays, random=random) for _ in range(2))
     counts = in_a & in_b
@@ -174,17 +174,17 @@ def step(
     momentum: float | Tensor = MOMENTUM,
     floor: float = FLOOR,
 ) -> tuple[Tensor, Tensor]:
-    """Compute one step of the solver by (L5).
+    """Compute one solver step from (L5).
 
     Args:
         x: Panel values (N, C, H, W).
-        y: Values (N, C, H, W) that extrapolate x by the momentum of the previous step. Initially they equal x.
+        y: Values (N, C, H, W) extrapolated from x by the previous step's momentum. Initially they equal x.
         targets: Target intensities (2, C, h, w) for the left and the right eye. If they have k times as many rows as
             the views, each of k head positions uses every k-th row.
-        views: Rays of the eyes.
-        size: Size of the step.
-        momentum: Momentum of the extrapolation.
-        floor: Lower limit of the curvature per set of rays.
+        views: The eyes' rays.
+        size: Step size.
+        momentum: Momentum used to extrapolate.
+        floor: Lower limit for the curvature per set of rays.
 
     Returns:
         The new panel values x' and their extrapolation y'.
@@ -209,9 +209,9 @@ def improved(panels: Tensor, targets: Tensor, views: Views, sizes: Sequence[Any]
     Args:
         panels: Initial panel values (N, C, H, W).
         targets: Target intensities (2, C, h, w) for the left and the right eye.
-        views: Rays of the eyes.
-        sizes: Size of each step.
-        momenta: Momentum of each step.
+        views: The eyes' rays.
+        sizes: Each step's size.
+        momenta: Each step's momentum.
     """
     x = y = panels
     for size, momentum in zip(sizes, momenta, strict=True):
@@ -223,7 +223,7 @@ def _bundles(panels: Tensor, views: Views) -> tuple[list[Tensor], Tensor]:
     """Return the complex values z_n of (L1) and a mask of valid rays.
 
     Returns:
-        A tensor (N, C, h, w) for each set of rays, and a mask (E, 1, h, w) of the rays that cross all panels.
+        A tensor (N, C, h, w) for each set of rays, and a mask (E, 1, h, w) of rays that cross all panels.
     """
     angle = torch.pi * panels
     parts = torch.cat([torch.cos(angle), torch.sin(angle)], dim=1)  # (N, 2C, H, W)
@@ -242,11 +242,11 @@ def _sample(
 
     Args:
         images: Images (N, K, H, W).
-        matrices: Homographies (N, 3, 3) from pixels of the result to pixels of the images.
-        size: Height and width (h, w) of the result.
-        near_px: Distance from the edge of an image beyond which a sample is valid. It may be negative.
-        within: Column and row positions (2, h, w) in [0, 1] inside the pixels of the result. The nearest pixels are
-            then sampled. By default, samples are bilinear at pixel centres.
+        matrices: Homographies (N, 3, 3) from the result's pixels to the images' pixels.
+        size: The result's height and width (h, w).
+        near_px: Minimum distance of valid samples from an image's edges. It may be negative.
+        within: Column and row positions (2, h, w) in [0, 1] inside the result's pixels, to sample the nearest pixels.
+            By default, samples are taken bilinearly at pixel centres.
 
     Returns:
         The samples (N, K, h, w), which are zero where they are not valid, and a mask (N, 1, h, w) of valid samples.

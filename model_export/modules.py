@@ -1,4 +1,4 @@
-"""Create and check picture networks: the published one, the solver's steps, or any `module:Class`."""
+"""Create and check picture networks: the published one, unrolled solver steps, or any `module:Class`."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from runtime.support.plugins import is_plugin, plugin_class, strict
 
 KNOWN = {"eyereal": "model_export.eyereal:EyeRealNet", "unrolled": "model_export.unrolled:Unrolled"}
 PANELS, COLOURS = 3, 3
-STEPS_MOST = 64  # maximum number of steps in a contract
+STEPS_MOST = 64  # maximum number of steps that a contract can hold
 
 
 class Form(Section):
-    """Input and output format of a picture network.
+    """A picture network's input and output format.
 
-    The class attributes of the network override the defaults.
+    The network's class attributes override the defaults.
     """
 
     input_frame: Literal["centre", "panel"] = Field(
@@ -55,17 +55,17 @@ class Form(Section):
 
 @dataclass(frozen=True, slots=True)
 class Network:
-    """Picture network with its input and output format and its options."""
+    """A picture network with its input and output format and its options."""
 
     arch: str  # name, or `module:Class`
     net: nn.Module
     form: Form
-    options: dict[str, Any]  # arguments with which `net` was created
+    options: dict[str, Any]  # arguments used to create `net`
 
     def steps(self) -> tuple[Sequence[Any], Sequence[Any]]:
-        """Return the sizes and the momenta of the solver steps after the network.
+        """Return the sizes and momenta of the solver steps that follow the network.
 
-        They are the tensors `step_sizes` and `step_momenta` of the network if these exist, otherwise constants.
+        They are the network's `step_sizes` and `step_momenta` tensors if these exist, otherwise constants.
         """
         learned = [getattr(self.net, name, None) for name in ("step_sizes", "step_momenta")]
         if isinstance(learned[0], Tensor) and isinstance(learned[1], Tensor):
@@ -75,11 +75,11 @@ class Network:
 
 @contextmanager
 def blamed(arch: str, field: str) -> Iterator[None]:
-    """Convert any exception that a user's module raises to an InputError with one line.
+    """Convert any exception raised by a user's module to a one-line InputError.
 
     Args:
-        arch: Name of the module, for the message.
-        field: Operation that failed, for the message.
+        arch: Name of the module, used in the message.
+        field: Operation that failed, used in the message.
     """
     try:
         with warnings.catch_warnings():
@@ -103,8 +103,8 @@ def make_network(arch: str, options: dict[str, Any], *, seed: int = 0) -> Networ
 
     Args:
         arch: Name of a network, or `module:Class`.
-        options: Arguments of the class, and `steps` for the number of solver steps after the network.
-        seed: Seed of the weights.
+        options: Arguments for the class, and optionally `steps`, the number of solver steps that follow the network.
+        seed: Seed for the weights.
 
     Raises:
         InputError: The network is unknown, the class cannot be loaded or created, or an attribute or option is invalid.
@@ -144,13 +144,13 @@ def probe(network: Network, *, width_px: int, height_px: int) -> None:
 
 
 def check_static(network: Network, *, width_px: int, height_px: int) -> None:
-    """Raise InputError if the network branches on the values of its input.
+    """Raise InputError if the network branches on its input's values.
 
     A graph cannot represent such branches.
     """
     example = torch.zeros(1, network.form.channels, height_px, width_px)
     try:
-        with quiet(), redirect_stderr(StringIO()), torch.no_grad():  # torch prints a graph that it cannot trace
+        with quiet(), redirect_stderr(StringIO()), torch.no_grad():  # torch prints any graph that it cannot trace
             torch.export.export(network.net.eval(), (example,), strict=False)
     except Exception as error:  # the exporter reports other failures
         if "data-dependent" in str(error).lower():
@@ -160,7 +160,7 @@ def check_static(network: Network, *, width_px: int, height_px: int) -> None:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Suppress warnings for developers of torch's exporter, and graphs that its C++ code prints."""
+    """Suppress warnings meant for developers of torch's exporter, and graphs printed by its C++ code."""
     sys.stdout.flush()
     level, output = logging.root.manager.disable, os.dup(1)
     with Path(os.devnull).open("wb") as nothing:

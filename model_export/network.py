@@ -1,4 +1,4 @@
-"""Network of the shipped models, which solves for the outer panels in closed form."""
+"""The shipped models' network, which solves for the outer panels in closed form."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from torch.nn import functional
 from runtime.kernels import FULL
 
 OUTPUTS = ("rear", "front", "check")
-BLOCK_ROWS = 8  # number of rows that are transformed together; the raster consists of complete blocks
-BOX = 0.5  # maximum change of the outer panels, which start in the middle of their range
+BLOCK_ROWS = 8  # number of rows transformed together; the raster consists of complete blocks
+BOX = 0.5  # maximum change in the outer panels, which start at the middle of their range
 IN_SCALE = 64  # divisor of the transformed inputs, which would otherwise overflow half precision
 
 
 class SpectralSolver(nn.Module):
     """Solver that computes both outer panels from the eyes' residuals on epipolar rows.
 
-    Let the panels be front = h + g and rear = h - g about the middle of their range. Let s be the parallax in columns
-    that half the separation of the eyes causes on an outer panel, and e the same parallax on the centre panel. Let w be
-    a frequency along the line of the eyes and v a frequency across this line. The difference of the eyes' pictures is
+    Let the panels be front = h + g and rear = h - g about the middle of their range. Let s be the parallax, in columns,
+    caused on an outer panel by half the eyes' separation, and e the same parallax on the centre panel. Let w be a
+    frequency along the line through the eyes and v a frequency across it. The difference between the eyes' pictures is
     D = 4i·(sin(ws)cos(we)·g + cos(ws)sin(we)·h).
 
-    A tracking error with standard deviations of c columns and r rows moves the pictures of the two panels in opposite
-    directions. It attenuates the mean of a wave by the factor m = exp(-(c²w² + r²v²)/2) and turns the rest into noise.
-    The expected squared error has a closed-form minimum for every frequency (`gains`).
+    A tracking error with standard deviations of c columns and r rows shifts the two panels' pictures in opposite
+    directions. It attenuates a wave's mean by the factor m = exp(-(c²w² + r²v²)/2) and turns the rest into noise. The
+    expected squared error has a closed-form minimum for every frequency (`gains`).
 
-    A raster row consists of cells of 2K columns. The transform along a row combines the modes of the chain
+    A raster row consists of cells, each 2K columns wide. The transform along a row combines the chain's modes
     (`runtime.model.chain`) with the frequencies of a cell's columns. The transform across the rows covers a block of
-    `BLOCK_ROWS` rows. The number K may differ from run to run, because the waves of a cell are inputs. The unit of
-    length along a row is always the parallax divided by `cell_px`, so that the gains do not depend on K.
+    `BLOCK_ROWS` rows. K may differ from run to run, because a cell's waves are inputs. The unit of length along a row
+    is always the parallax divided by `cell_px`, so that the gains do not depend on K.
     """
 
     def __init__(self, cell_px: int = 4) -> None:
@@ -41,7 +41,7 @@ class SpectralSolver(nn.Module):
         self.rows_in: Tensor
         self.rows_out: Tensor
         self.v: Tensor
-        # The row transform of a block also computes a difference and a sum: of the eyes on input, of g and h on output.
+        # A block's row transform also computes a difference and a sum: of the eyes on input, of g and h on output.
         into = torch.cat([torch.cat([-rows, rows], dim=1), torch.cat([rows, rows], dim=1)]) / IN_SCALE
         back = rows.transpose(0, 1) * FULL
         out = torch.stack([torch.cat([-back, back], dim=1), torch.cat([back, back], dim=1)])
@@ -55,19 +55,19 @@ class SpectralSolver(nn.Module):
     def gains(self, spectrum: Tensor, cell_frequencies: Tensor, eye_sigma_px: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Compute the gains from the transformed input to g and h.
 
-        A pattern is the product of a wave of a block's rows and a wave of a cell's columns.
+        A pattern is the product of a wave along a block's rows and a wave along a cell's columns.
 
         Args:
-            spectrum: Singular values s (cells + 1,) of the chain.
-            cell_frequencies: The input (2K,) of `forward`.
-            eye_sigma_px: The input (3,) of `forward`.
+            spectrum: The chain's singular values s (cells + 1,).
+            cell_frequencies: The input of `forward` with this name (2K,).
+            eye_sigma_px: The input of `forward` with this name (3,).
 
         Returns:
-            The numerator and the denominator of the gain of g, which excludes the part that h explains, and the gain of
-            h. All three have the shape (patterns, cells + 1).
+            The numerator and denominator of g's gain, which excludes the part explained by h, and h's gain. All three
+            have shape (patterns, cells + 1).
         """
         scale = torch.exp(self.log_sigma_scale)
-        # The product of a chain's mode and a block's pattern is two waves, at the pattern's frequency ± `offset`.
+        # The product of a chain mode and a block's pattern is two waves, at the pattern's frequency ± `offset`.
         offset = 2 * torch.asin(torch.clamp(spectrum / 4, 0, 1))[None] / (2 * self.cell_px)
         pattern = (cell_frequencies[None] / self.cell_px + torch.zeros_like(self.v)).reshape(-1, 1)
         pattern_v = (self.v + torch.zeros_like(cell_frequencies)[None]).reshape(-1, 1)
@@ -88,34 +88,35 @@ class SpectralSolver(nn.Module):
         return share * m * spectrum[None], share * alpha2 + cost_g, gain_h
 
     def forward(self, *feeds: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Compute the rear and the front panel for C colour channels.
+        """Compute the rear and front panels for C colour channels.
 
         Args:
-            *feeds: The tensors that `INPUTS` names.
+            *feeds: The tensors named in `INPUTS`.
 
-                * `left`, `right`: residual of each eye along the eye's rays through the raster, (rows, cells, 2K·C)
-                  16-bit codes.
+                * `left`, `right`: each eye's residual along its rays through the raster, (rows, cells, 2K·C) 16-bit
+                  codes.
                 * `waves`, `shifted_waves`, `spectrum`, `modes_in`: V and Ũ (cells + 1, cells + 1), s (cells + 1,) and
-                  U^T (cells + 1, cells) of `runtime.model.chain.chain_modes`.
-                * `cell_waves`, `cell_frequencies`: (2K, 2K) and (2K,) of `runtime.model.chain.cell_waves`.
-                * `eye_sigma_px`: c, r and e (3,). The unit of c and e is the parallax divided by `cell_px`, the unit of
-                  r is a row.
+                  U^T (cells + 1, cells) from `runtime.model.chain.chain_modes`.
+                * `cell_waves`, `cell_frequencies`: (2K, 2K) and (2K,) from `runtime.model.chain.cell_waves`.
+                * `eye_sigma_px`: c, r and e (3,). c and e are in units of the parallax divided by `cell_px`, and r is
+                  in rows.
 
         Returns:
-            The rear and the front panel, (rows, cells + 1, 2K·C) 16-bit codes that begin one parallax before column 0,
+            The rear and front panels, as (rows, cells + 1, 2K·C) 16-bit codes that begin one parallax before column 0,
             and a number (1,) that is finite if all intermediate results are finite.
         """
         rear, front, check = self._solved(feeds, added=0.5)
-        # The cast truncates. Adding a half rounds instead, because the values are clamped to be non-negative.
+        # The cast truncates. Having a half added makes it round instead, because the values are clamped to be
+        # non-negative.
         codes = (_by_rows(torch.clamp(x, 0, FULL + 0.5), like=feeds[0]).to(torch.int16) for x in (rear, front))
         return (*codes, check)  # type: ignore[return-value]
 
     def _solved(self, feeds: tuple[Tensor, ...], *, added: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the rear and the front panel (1, rows of a block, all others) and the check.
+        """Return the rear and front panels, each (1, rows of a block, all others), and the check.
 
-        The panels are in 16-bit codes plus `added`. The same row of all blocks is stored together, and each row of a
-        cell stays contiguous. Copies are therefore cheap, and the products with the matrices of the rows and of the
-        chain are few and large.
+        The panels are in 16-bit codes plus `added`. Corresponding rows of all blocks are stored together, and each row
+        of a cell stays contiguous. Copies are therefore cheap, and the products with the row and chain matrices are few
+        and large.
         """
         left, right, waves, shifted_waves, spectrum, modes_in, cell_waves, cell_frequencies, eye_sigma_px = feeds
         numerator, denominator, gain_h = self.gains(spectrum, cell_frequencies, eye_sigma_px)
@@ -128,25 +129,25 @@ class SpectralSolver(nn.Module):
         both = _in_columns(both, torch.cat([numerator / denominator, gain_h]), cell_waves)
         both = both.reshape(2, BLOCK_ROWS, both.shape[1], -1)
         both = torch.matmul(torch.stack([waves, shifted_waves])[:, None], both).reshape(1, rows, -1)
-        # The matrix product is written as a convolution, which is fused with the addition and the clamp.
+        # The matrix product is written as a convolution so that it is fused with the addition and the clamp.
         rear, front = (functional.conv1d(both, out[..., None], bias) for out in self.rows_out)
         return rear, front, _size(both)
 
 
 def _in_columns(x: Tensor, gains: Tensor, cell_waves: Tensor) -> Tensor:
-    """Scale each wave along the columns of a cell by its gain.
+    """Scale each wave along a cell's columns by its gain.
 
-    For each wave of the rows and each mode, a single matrix transforms the columns to waves, scales the waves and
-    transforms them back.
+    For each row wave and each mode, a single matrix transforms the columns to waves, scales the waves and transforms
+    them back.
 
     Args:
-        x: Values (n, modes, blocks, 2K·C) for n waves of the rows.
+        x: Values (n, modes, blocks, 2K·C) for n row waves.
         gains: Gains (n·2K, modes).
-        cell_waves: Waves (2K, 2K) of a cell's columns.
+        cell_waves: Waves (2K, 2K) along a cell's columns.
     """
     count, modes, _, row = x.shape
     columns = cell_waves.shape[0]
-    # Projections of a cell's row onto each wave of the columns.
+    # Projections of a cell's row onto each column wave.
     parts = cell_waves[:, :, None, None, None] * cell_waves[:, None, None, :, None]
     parts = (parts * _same(row // columns, like=parts)).reshape(columns, -1)
     matrices = torch.matmul(gains.reshape(count, -1, modes).transpose(1, 2), parts)
@@ -154,24 +155,24 @@ def _in_columns(x: Tensor, gains: Tensor, cell_waves: Tensor) -> Tensor:
 
 
 def _same(channels: int, *, like: Tensor) -> Tensor:
-    """Return the identity matrix of the colour channels as a tensor (C, 1, C)."""
+    """Return the identity matrix over the colour channels as a (C, 1, C) tensor."""
     one = torch.arange(channels, device=like.device)
     return (one[:, None, None] == one).to(torch.float32)
 
 
 def _by_block_rows(image: Tensor) -> Tensor:
-    """Rearrange an image (rows, cells, 2K·C) to (rows of a block, cells, blocks, 2K·C)."""
+    """Rearrange an image from (rows, cells, 2K·C) to (rows of a block, cells, blocks, 2K·C)."""
     return image.reshape(-1, BLOCK_ROWS, *image.shape[1:]).permute(1, 2, 0, 3)
 
 
 def _by_rows(x: Tensor, *, like: Tensor) -> Tensor:
-    """Invert `_by_block_rows` for a tensor (rows of a block, all others) with one cell more than `like`."""
+    """Invert `_by_block_rows` for a tensor (rows of a block, all others) with one more cell than `like`."""
     cells, row = like.shape[1] + 1, like.shape[2]
     return x.reshape(BLOCK_ROWS, cells, -1, row).permute(2, 0, 1, 3).reshape(-1, cells, row)
 
 
 def _size(x: Tensor) -> Tensor:
-    """Return the norm (1,) of a tensor. It is finite only if all values are finite and not too large."""
+    """Return a tensor's norm (1,), which is finite only if all values are finite and not too large."""
     size: Tensor = torch.linalg.vector_norm(x)  # the squares overflow long before later products would
     return size.reshape(1)
 

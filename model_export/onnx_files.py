@@ -37,19 +37,19 @@ FIXED = {"one", "channels", "eye_sigmas"}
 
 
 def spectral_bytes(net: nn.Module, *, cell_px: int) -> bytes:
-    """Export the spectral solver as an ONNX file for any number of rows, cells and columns."""
+    """Export the spectral solver to an ONNX file that accepts any number of rows, cells and columns."""
     sides = (torch.zeros(16, 8, 6 * cell_px, dtype=torch.int16),) * 2
     modes = tuple(torch.from_numpy(part) for part in (*chain_modes(8), *cell_waves(cell_px)))
     return _exported(net, (*sides, *modes, torch.ones(3)), INPUTS, network.OUTPUTS, CELL_AXES, folded=False)
 
 
 def ports(names: Sequence[str]) -> tuple[Port, ...]:
-    """Return the contract's declarations of the inputs or outputs with the given names."""
+    """Return declarations of the named inputs or outputs, as used in a contract."""
     return tuple(Port(name=name, axes=(CELL_AXES | PICTURE_AXES)[name]) for name in names)
 
 
 def picture_bytes(net: nn.Module, *, channels: int, width_px: int, height_px: int) -> bytes:
-    """Export a picture network as an ONNX file for pictures of one size."""
+    """Export a picture network to an ONNX file for pictures of one size."""
     return _exported(net, (torch.zeros(1, channels, height_px, width_px),), (eyereal.INPUT,), (eyereal.OUTPUT,), {})
 
 
@@ -74,14 +74,14 @@ def _exported(
     *,
     folded: bool = True,
 ) -> bytes:
-    """Export a module as an ONNX file.
+    """Export a module to an ONNX file.
 
     Args:
         net: Module to export, in evaluation mode.
-        example: Example of the inputs.
-        inputs: Names of the inputs.
-        outputs: Names of the outputs.
-        axes: Names of the dimensions by input or output. Dimensions that `FIXED` does not name are variable.
+        example: Example inputs.
+        inputs: Input names.
+        outputs: Output names.
+        axes: Names of the dimensions, keyed by input or output. Dimensions not listed in `FIXED` are variable.
         folded: Fold constants. If False, the weights keep their names.
     """
     buffer = io.BytesIO()

@@ -1,4 +1,4 @@
-"""Prepare training pairs for picture networks: the input, the targets and the rays of the eyes."""
+"""Prepare training pairs for picture networks: the input, the targets and the eyes' rays."""
 
 from __future__ import annotations
 
@@ -30,25 +30,25 @@ from runtime.records import F32, F64, U8
 from runtime.support.gl import offscreen_context
 from runtime.support.picture_file import read_image
 
-PICTURE_FOV_DEG = 40.0  # field of view of pictures in the published data set
+PICTURE_FOV_DEG = 40.0  # field of view of the pictures in the published data set
 
 
 @dataclass(frozen=True)
 class TrainingPairs(Dataset[dict[str, Tensor]]):
-    """Data set for training a picture network.
+    """Data set used to train a picture network.
 
-    Each pair depends only on the seed and the number of the pair.
+    Each pair depends only on the seed and the pair's number.
 
     The pictures are read from a folder, rendered from a scene, or generated at random.
     """
 
-    form: Form  # input format of the network
+    form: Form  # the network's input format
     seed: int
     width_px: int  # width of the panels and the pictures
     height_px: int  # height of the panels and the pictures
     eye_sigma_mm: float  # standard deviation of the tracking error along one axis
-    count: int = 0  # number of different pairs, after which they repeat; 0 means unlimited
-    stack: PanelStack | None = None  # geometry of the panels, or None for random panels
+    count: int = 0  # number of different pairs before they repeat; 0 means unlimited
+    stack: PanelStack | None = None  # panel geometry, or None for random panels
     folder: tuple[Pair, ...] = ()  # pairs to use; if empty, pairs are rendered or generated
     scene: str = ""  # scene to render at random rotations about the vertical axis; if empty, pairs are generated
 
@@ -56,9 +56,9 @@ class TrainingPairs(Dataset[dict[str, Tensor]]):
         """Return a pair as tensors.
 
         Returns:
-            `input` is the input of the network (channels, H, W), and `targets` the target intensities (2, 3, h, w).
-            `believed` and `views` are homographies (2, N, 3, 3) as in `light.Views`, for the estimated eyes and for the
-            true eyes.
+            `input` is the network's input (channels, H, W), and `targets` holds the target intensities (2, 3, h, w).
+            `believed` and `views` are homographies (2, N, 3, 3) as in `light.Views`, for the estimated and for the true
+            eye positions.
         """
         pair = self.pair(number)
         random = np.random.default_rng([self.seed, number, 1])
@@ -82,7 +82,7 @@ class TrainingPairs(Dataset[dict[str, Tensor]]):
         return self.count
 
     def pair(self, number: int) -> TrainingPair:
-        """Return the pictures, the panels and the eyes of the pair with this number."""
+        """Return the pictures, panels and eye positions of the pair with this number."""
         if self.folder:
             pair = self.folder[number % len(self.folder)]
             return photographed(
@@ -94,7 +94,7 @@ class TrainingPairs(Dataset[dict[str, Tensor]]):
         return random_pair(random, **self._size, stack=self.stack, fov_deg=self.form.picture_fov_deg)
 
     def _drawn(self, random: np.random.Generator) -> TrainingPair:
-        """Render the scene for random eyes, at a random time and a random rotation about the vertical axis."""
+        """Render the scene for random eye positions, at a random time and rotation about the vertical axis."""
         width_px, height_px = self.width_px, self.height_px
         stack, eyes_m = random_place(random, **self._size, stack=self.stack or prototype(**self._size))
         fov_deg = self.form.picture_fov_deg or filling_fov_deg(stack, eyes_m.mean(axis=0))
@@ -118,10 +118,10 @@ def opened(scene: str, stack: PanelStack, _process: int) -> ContentSource:
 
 
 def folder_pairs(folder: Path) -> tuple[Pair, ...]:
-    """Read the pairs in a folder that has the format of the published data set.
+    """Read the pairs in a folder laid out like the published data set.
 
     Raises:
-        InputError: The name of the folder does not contain the name of a published scene, or the folder is invalid.
+        InputError: The folder's name does not contain a published scene's name, or the folder is invalid.
     """
     name = next((name for name in preset_names() if name in folder.resolve().name), "")
     if not name:
@@ -132,17 +132,17 @@ def folder_pairs(folder: Path) -> tuple[Pair, ...]:
 
 
 def prototype(*, width_px: int, height_px: int) -> PanelStack:
-    """Return the panels for which the published pictures were rendered."""
+    """Return the panels that the published pictures were rendered for."""
     return PanelStack(PITCH_WIDTH_M, PITCH_WIDTH_M * 9 / 16, (-0.06, 0.0, 0.06), width_px, height_px)
 
 
 def photographed(pair: Pair, stack: PanelStack, fov_deg: float) -> TrainingPair:
-    """Resample a published pair as if the eyes looked at the centre of the display.
+    """Resample a published pair as if the eyes looked at the display's centre.
 
     Args:
         pair: Pair to resample.
-        stack: Geometry of the panels, whose size in pixels the pictures get.
-        fov_deg: Horizontal field of view of the pictures in degrees.
+        stack: Panel geometry. The pictures are resized to the panels' size in pixels.
+        fov_deg: The pictures' horizontal field of view in degrees.
     """
     size, images = {"width_px": stack.width_px, "height_px": stack.height_px}, []
     for side, eye_m in enumerate(pair.eyes_m):
@@ -155,7 +155,7 @@ def photographed(pair: Pair, stack: PanelStack, fov_deg: float) -> TrainingPair:
 
 
 def network_input(pair: TrainingPair, form: Form) -> F32:
-    """Return the input (channels, H, W) of a picture network.
+    """Return a picture network's input (channels, H, W).
 
     The channels are ordered by panel, then eye, then RGB.
     """
@@ -174,14 +174,14 @@ def network_input(pair: TrainingPair, form: Form) -> F32:
 
 
 def _warped(picture: U8, picture_from_raster: F64, stack: PanelStack, border: int) -> U8:
-    """Resample a picture bilinearly to the pixels of a panel.
+    """Resample a picture bilinearly to a panel's pixels.
 
     Args:
         picture: Picture (h, w, 3).
-        picture_from_raster: Homography from pixels of the panel to pixels of the picture, with pixel centres at
-            half-integers. It is converted for OpenCV, whose pixel centres are integers.
-        stack: Geometry of the panels.
-        border: Border mode of OpenCV for pixels outside the picture.
+        picture_from_raster: Homography from panel pixels to picture pixels, with pixel centres at half-integers. It is
+            converted for OpenCV, which puts pixel centres at integers.
+        stack: Panel geometry.
+        border: OpenCV's border mode for pixels outside the picture.
     """
     to_centres = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
     matrix = np.linalg.inv(to_centres) @ picture_from_raster @ to_centres

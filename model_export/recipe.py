@@ -1,4 +1,4 @@
-"""Read the recipes of the shipped models, which are small JSON files."""
+"""Read the shipped models' recipes, which are small JSON files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DESIGN_RANGE = TrainedFor(
 
 
 class Recipe(Section):
-    """Recipe of a shipped model, which is a closed-form network followed by solver steps."""
+    """Recipe for a shipped model, which is a closed-form network followed by solver steps."""
 
     name: str
     arch: Literal["spectral"] = "spectral"
@@ -29,12 +29,12 @@ class Recipe(Section):
     steps: Steps = ()
 
     def sha256(self) -> str:
-        """Return the SHA-256 of the recipe's canonical JSON, which the contract contains."""
+        """Return the SHA-256 of the recipe's canonical JSON, for inclusion in the contract."""
         text = json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()
 
 
 def read_recipe(name: str) -> Recipe:
-    """Read the recipe of a shipped model. Raises InputError if the recipe is missing or invalid."""
+    """Read a shipped model's recipe. Raises InputError if the recipe is missing or invalid."""
     path = RECIPES / f"{name}.json"
     return validated(Recipe, dict(untrusted_input.read_json(path)), source=path)

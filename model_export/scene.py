@@ -1,4 +1,4 @@
-"""Generate random scenes of textured cards, and draw them with exact geometry for any eye."""
+"""Generate random scenes of textured cards, and draw them with exact geometry as seen by any eye."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8
 
 FINER = 2  # supersampling factor for antialiasing
-TEXELS = (24, 768)  # minimum and maximum side of a texture in pixels
+TEXELS = (24, 768)  # minimum and maximum side length of a texture, in pixels
 Random = np.random.Generator
 
 
 @dataclass(frozen=True, slots=True)
 class Plane:
-    """Textured parallelogram.
+    """A textured parallelogram.
 
-    The point (u, v) of the texture is at corner + u·across + v·down for 0 <= u, v <= 1.
+    The texture's point (u, v) is at corner + u·across + v·down for 0 <= u, v <= 1.
     """
 
     texture: U8  # (h, w, 4) RGBA
@@ -35,18 +35,18 @@ Scene = tuple[Plane, ...]
 def draw(scene: Scene, projection: F64, *, width_px: int, height_px: int) -> U8:
     """Draw a picture (h, w, 3) of a scene.
 
-    Each pixel shows the plane that is nearest at this pixel. Translucent edges are blended with planes drawn earlier.
+    Each pixel shows the plane that is nearest there. Translucent edges are blended with the planes drawn earlier.
     Nothing behind the eye is drawn.
 
     Args:
-        scene: Planes in drawing order.
-        projection: Projection (3, 4) from homogeneous metres in the frame `stack` to homogeneous pixels.
-        width_px: Width of the picture.
-        height_px: Height of the picture.
+        scene: Planes, in the order they are drawn.
+        projection: 3x4 projection from homogeneous metres in the `stack` frame to homogeneous pixels.
+        width_px: Picture width.
+        height_px: Picture height.
     """
     width, height = width_px * FINER, height_px * FINER
     picture = np.zeros((height, width, 3), np.float32)
-    nearness = np.zeros((height, width), np.float32)  # reciprocal of the distance, which is negative behind the eye
+    nearness = np.zeros((height, width), np.float32)  # reciprocal of the distance; negative behind the eye
     for plane in scene:
         on_raster = (
             np.diag([FINER, FINER, 1.0])
@@ -61,9 +61,9 @@ def draw(scene: Scene, projection: F64, *, width_px: int, height_px: int) -> U8:
 
 
 def _part(raster_from_plane: F64, width: int, height: int) -> tuple[slice, slice] | None:
-    """Return the rows and the columns of the raster that a plane can cover, or None if it is not visible.
+    """Return the raster rows and columns that a plane can cover, or None if it is not visible.
 
-    The homography maps texture coordinates (u, v, 1) of the plane to pixels of the raster.
+    The homography maps the plane's texture coordinates (u, v, 1) to raster pixels.
     """
     corners = raster_from_plane @ np.array([[0, 1, 1, 0], [0, 0, 1, 1], [1, 1, 1, 1]], dtype=np.float64)
     area = np.linalg.det(raster_from_plane)
@@ -78,14 +78,14 @@ def _part(raster_from_plane: F64, width: int, height: int) -> tuple[slice, slice
 
 
 def _draw_plane(texture: U8, raster_from_plane: F64, part: tuple[slice, slice], picture: F32, nearness: F32) -> None:
-    """Draw a plane where it is nearer than the planes in the picture so far.
+    """Draw a plane wherever it is nearer than the planes drawn so far.
 
     Args:
-        texture: Texture (h, w, 4) of the plane.
-        raster_from_plane: Homography from texture coordinates (u, v, 1) to pixels of the picture.
+        texture: The plane's texture (h, w, 4).
+        raster_from_plane: Homography from texture coordinates (u, v, 1) to picture pixels.
         part: Rows and columns of the picture that the plane can cover.
-        picture: Picture (H, W, 3), which is updated.
-        nearness: Reciprocal distance (H, W) of the planes in the picture, which is updated.
+        picture: Picture (H, W, 3), updated in place.
+        nearness: Reciprocal distance (H, W) of the planes in the picture, updated in place.
     """
     rows, columns = part
     left, top = columns.start, rows.start
@@ -96,7 +96,7 @@ def _draw_plane(texture: U8, raster_from_plane: F64, part: tuple[slice, slice], 
     drawn = cv2.warpPerspective(texture, shifted, (columns.stop - left, rows.stop - top), flags=cv2.INTER_LINEAR)
     inverse = np.linalg.inv(raster_from_plane)
     u, v = np.arange(left, columns.stop) + 0.5, np.arange(top, rows.stop)[:, None] + 0.5
-    # If a pixel is mapped back to the plane, the third coordinate is the reciprocal of its distance along the gaze.
+    # When a pixel is mapped back to the plane, the third coordinate is the reciprocal of its distance along the gaze.
     near = (inverse[2, 0] * u + inverse[2, 1] * v + inverse[2, 2]).astype(np.float32)
     alpha = drawn[..., 3].astype(np.float32) * np.float32(1 / 255)
     alpha *= near >= nearness[part]
@@ -105,12 +105,12 @@ def _draw_plane(texture: U8, raster_from_plane: F64, part: tuple[slice, slice], 
 
 
 def _shift(right: float, down: float) -> F64:
-    """Return the homography (3, 3) that translates by a number of pixels."""
+    """Return the 3x3 homography that translates by a number of pixels."""
     return np.array([[1.0, 0.0, right], [0.0, 1.0, down], [0.0, 0.0, 1.0]])
 
 
 def random_scene(random: Random, stack: PanelStack, middle_m: F64) -> Scene:
-    """Return a random scene for a viewer whose head is near `middle_m` (3,) in the frame `stack`.
+    """Return a random scene for a viewer whose head is near `middle_m` (3,) in the `stack` frame.
 
     The scene has a backdrop and cards at random depths behind and in front of the panels.
     """
@@ -127,10 +127,10 @@ def random_scene(random: Random, stack: PanelStack, middle_m: F64) -> Scene:
         """Return a card with a random texture.
 
         Args:
-            x_m: Depth of the card in the frame `stack`.
-            size_m: Width and height (2,) of the card.
-            aside: Position (2,) at which the viewer sees the card on the middle panel, relative to the panel's size.
-            slant: Largest angle in radians by which the card is turned.
+            x_m: The card's depth in the `stack` frame.
+            size_m: The card's width and height (2,).
+            aside: Position (2,) where the viewer sees the card on the middle panel, relative to the panel's size.
+            slant: The card's maximum rotation, in radians.
             see_through: Make the texture opaque only on lines.
         """
         share = (x_m - centre_m) / distance_m
@@ -162,9 +162,9 @@ def _texture(random: Random, width: int, height: int, tones: U8, *, see_through:
 
     Args:
         random: Source of all random numbers.
-        width: Width of the texture.
-        height: Height of the texture.
-        tones: Table (256,) that is applied to all colours.
+        width: Texture width.
+        height: Texture height.
+        tones: Lookup table (256,) applied to all colours.
         see_through: Make the texture opaque only on random lines.
     """
     picture = np.full((height, width, 4), 255, np.uint8)

@@ -1,4 +1,4 @@
-"""Inputs for checking a model: an ordinary pair of pictures, and extreme pictures."""
+"""Inputs used to check a model: an ordinary pair of pictures, and extreme ones."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from runtime.records import F32
 Feeds = dict[str, np.ndarray]
 ORDINARY = "ordinary pair"
 EXTRA = ("one eye black", "noise")
-LARGE_PX = 1_000_000  # number of pixels above which the cases `EXTRA` are skipped
+LARGE_PX = 1_000_000  # number of pixels above which the `EXTRA` cases are skipped
 
 
 def stress_pictures(height: int, width: int) -> dict[str, tuple[F32, F32]]:
-    """Return extreme pairs of pictures by name: left and right intensities (h, w, 3) in [0, 1]."""
+    """Return extreme pairs of pictures, keyed by name: left and right intensities (h, w, 3) in [0, 1]."""
     v, u = np.mgrid[0:height, 0:width]
 
     def grey(values: np.ndarray) -> F32:
@@ -42,14 +42,14 @@ def stress_pictures(height: int, width: int) -> dict[str, tuple[F32, F32]]:
 
 
 def ordinary_pictures(height: int, width: int) -> tuple[F32, F32]:
-    """Return the left and the right picture (h, w, 3) of a random scene, with intensities in [0, 1]."""
+    """Return left and right pictures (h, w, 3) of a random scene, with intensities in [0, 1]."""
     pair = random_pair(np.random.default_rng([77, 0]), width_px=width, height_px=height)
     left, right = (image.astype(np.float32) / np.float32(255) for image in pair.images)
     return left, right
 
 
 def spectral_cases(cell_px: int) -> dict[str, Feeds]:
-    """Return inputs of the spectral solver by name, with three row lengths and tracking errors."""
+    """Return inputs for the spectral solver, keyed by name, with three row lengths and tracking errors."""
     cases = {}
     for cells, eye_sigma_px in ((16, (0.0, 0.0, 0.5)), (112, (0.13, 0.15, 0.3)), (400, (0.5, 0.6, 0.1))):
         size = (64, cells * 2 * cell_px)
@@ -67,7 +67,7 @@ def spectral_cases(cell_px: int) -> dict[str, Feeds]:
 
 
 def picture_cases(contract: Contract, height: int, width: int) -> dict[str, Feeds]:
-    """Return inputs of a picture network by name. The pictures are the same for every panel."""
+    """Return inputs for a picture network, keyed by name. The pictures are the same for every panel."""
     cases = {ORDINARY: ordinary_pictures(height, width), **stress_pictures(height, width)}
     if height * width > LARGE_PX:  # the published network takes seconds per case
         for name in EXTRA:
@@ -77,15 +77,15 @@ def picture_cases(contract: Contract, height: int, width: int) -> dict[str, Feed
 
 
 def picture_feeds(pictures: tuple[F32, F32], contract: Contract, panels: int) -> Feeds:
-    """Return the input of a picture network for a pair of pictures.
+    """Convert a pair of pictures to a picture network's input.
 
     Args:
         pictures: Left and right intensities (h, w, 3) in [0, 1].
-        contract: Contract of the network.
-        panels: Number of panels for which the pictures are repeated.
+        contract: The network's contract.
+        panels: Number of panels to repeat the pictures for.
 
     Returns:
-        The name of the input and its value (1, 6·panels, h, w). Channels are ordered by panel, then eye, then RGB.
+        The input's name, mapped to its value (1, 6·panels, h, w). Channels are ordered by panel, then eye, then RGB.
     """
     if contract.input_value == "phase":
         left, right = (phase_from_intensity(picture, contract.branch) for picture in pictures)

@@ -1,7 +1,7 @@
-"""Train a picture network with the error of the light at the eyes as the loss (`phasestack train`).
+"""Train a picture network, with the error in the light at the eyes as the loss (`phasestack train`).
 
-The optimizer is AdamW with cosine decay of the learning rate. Pair k and all random numbers of iteration k depend only
-on the seed and k. A training that is interrupted and resumed therefore gives the same result as an uninterrupted one.
+The optimizer is AdamW with cosine decay of the learning rate. Pair k and all random numbers used in iteration k depend
+only on the seed and k, so a training run that is interrupted and resumed gives the same result as an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ from runtime.report.page import drawing, png
 from runtime.support.artifacts import write_bytes, write_text
 from runtime.support.progress import progress_bar
 
-HELD_OUT_SEED = 9_000_001  # seed of the validation pairs, which is greater than any training seed
-HELD_OUT, HELD_OUT_SHARE = 6, 8  # number of generated validation pairs; one in this many pairs of a folder is held out
-FIRST_SAVED = 10  # iteration of the first checkpoint, from which a short training can be resumed
-SMALL_PX = 30_000  # number of pixels per batch up to which one thread is faster (17 s instead of 24 s at 160x90)
+HELD_OUT_SEED = 9_000_001  # seed for the validation pairs, greater than any training seed
+HELD_OUT, HELD_OUT_SHARE = 6, 8  # number of generated validation pairs; one in this many pairs in a folder is held out
+FIRST_SAVED = 10  # iteration of the first checkpoint, so that even a short training run can be resumed
+SMALL_PX = 30_000  # pixels per batch; up to this number, one thread is faster (17 s instead of 24 s at 160x90)
 COLUMNS = ("iteration", "light_db", "held_out_light_db")
 Device = Literal["auto", "cpu", "cuda"]
 Batch = dict[str, Tensor]
 
 
 class Training(Section):
-    """Settings that determine the result of a training. They are stored in the checkpoint."""
+    """Settings that determine a training run's result. They are stored in the checkpoint."""
 
     arch: str
     options: Annotated[dict[str, Any], Field(default_factory=dict)]
@@ -69,12 +69,12 @@ def run_training(out: Path, training: Training, *, device: Device = "auto", resu
 
     Args:
         out: Folder for `checkpoint.pth`, `curve.csv` and `curve.png`.
-        training: Settings of the training.
+        training: Training settings.
         device: Device to train on. `auto` selects a GPU if torch finds one.
         resume: Continue from the checkpoint in `out`.
 
     Returns:
-        The summary of the command.
+        A summary of the run, for the command to report.
 
     Raises:
         InputError: The network, the data or the checkpoint is invalid, or the loss is not finite.
@@ -148,7 +148,7 @@ def run_training(out: Path, training: Training, *, device: Device = "auto", resu
 
 @contextlib.contextmanager
 def _signals() -> Iterator[list[int]]:
-    """Yield a list to which the first SIGINT or SIGTERM is appended. A second signal exits immediately.
+    """Yield a list that receives the first SIGINT or SIGTERM. A second signal exits immediately.
 
     The caller must check the list after each iteration.
     """
@@ -177,9 +177,9 @@ def displayed(panels: Tensor) -> Tensor:
 
 
 def _loss(network: Network, batch: Batch) -> Tensor:
-    """Return the negative mean over the pairs of the light PSNR in dB.
+    """Return the light PSNR in dB, averaged over the pairs and negated.
 
-    The mean of logarithms gives easy and hard pairs equal weight.
+    Averaging logarithms gives easy and hard pairs equal weight.
     """
     with torch.autocast(batch["input"].device.type, torch.bfloat16, enabled=batch["input"].is_cuda):
         answer = network.net.train()(batch["input"])
@@ -195,7 +195,7 @@ def _loss(network: Network, batch: Batch) -> Tensor:
 def _shown(network: Network, answer: Tensor, batch: Batch) -> Iterator[Tensor]:
     """Yield the displayed panel values (N, C, H, W) of each pair in a batch.
 
-    The solver's steps for the estimated eyes are applied to the output of the network.
+    The solver's steps, computed for the estimated eye positions, are applied to the network's output.
     """
     for panels, targets, matrices in zip(displayed(answer.float()), batch["targets"], batch["believed"], strict=True):
         views = Views(matrices, targets.shape[-1], targets.shape[-2])
@@ -205,7 +205,7 @@ def _shown(network: Network, answer: Tensor, batch: Batch) -> Iterator[Tensor]:
 
 @torch.no_grad()
 def _held_out_db(network: Network, batches: list[Batch], device: torch.device) -> float:
-    """Return the mean light PSNR in dB of the validation pairs, which random rays estimate without bias."""
+    """Return the validation pairs' mean light PSNR in dB, from unbiased estimates with random rays."""
     lights_db = []
     for number, batch in enumerate(_on(batch, device) for batch in batches):
         with blamed(network.arch, "validation"):
@@ -221,7 +221,7 @@ def _held_out_db(network: Network, batches: list[Batch], device: torch.device) -
 def _data(training: Training, form: Form) -> tuple[TrainingPairs, TrainingPairs]:
     """Return the training pairs and the validation pairs.
 
-    Raises InputError if the panels or the folder of pairs are unsuitable, or if both a folder and a scene are given.
+    Raises InputError if the panels or the folder of pairs is unsuitable, or if both a folder and a scene are given.
     """
     width_px, height_px = training.width_px, training.height_px
     stack = load_stack(Path(training.panels), width_px=width_px, height_px=height_px) if training.panels else None
@@ -242,7 +242,7 @@ def _data(training: Training, form: Form) -> tuple[TrainingPairs, TrainingPairs]
 
 
 def _loader(pairs: TrainingPairs, training: Training, first: int, last: int) -> DataLoader[Batch]:
-    """Load the batches of the iterations after `first` up to `last`.
+    """Load the batches for the iterations after `first`, up to and including `last`.
 
     Each batch depends only on its number.
     """
@@ -264,20 +264,20 @@ def _on(batch: Batch, device: torch.device) -> Batch:
 def _resumed(
     out: Path, training: Training, network: Network, *parts: Any
 ) -> tuple[int, list[list[float]], list[float]]:
-    """Restore the weights, the optimizer and the learning rate from the checkpoint of a training.
+    """Restore the weights, the optimizer and the learning rate from a training run's checkpoint.
 
     Args:
-        out: Folder of the checkpoint.
+        out: Folder that contains the checkpoint.
         training: Settings, which must equal those in the checkpoint.
         network: Network that receives the weights.
-        *parts: Optimizer and scheduler of the learning rate, which receive their states.
+        *parts: Optimizer and learning rate scheduler, which receive their states.
 
     Returns:
-        The number of completed iterations, the learning curve, and the light PSNR of each iteration since the last
-        point of the curve.
+        The number of completed iterations, the learning curve, and the light PSNR of every iteration since the curve's
+        last point.
 
     Raises:
-        InputError: The checkpoint is invalid or has other settings.
+        InputError: The checkpoint is invalid or has different settings.
     """
     path = out / "checkpoint.pth"
     table = load_checkpoint(path)

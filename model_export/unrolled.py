@@ -1,4 +1,4 @@
-"""Trainable network of solver steps, whose weights are the sizes and the momenta of the steps."""
+"""A trainable network of solver steps, whose weights are the step sizes and momenta."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from runtime.config import Section
 
 
 class Unrolled(nn.Module):
-    """Network whose only weights are the sizes and the momenta of the solver steps after it.
+    """Network whose only weights are the sizes and momenta of the solver steps that follow it.
 
-    The steps start from panels that have equal shares of the mean picture.
+    The steps start from panels that share the mean picture equally.
     """
 
     class Options(Section):
-        """Number of steps and their initial size."""
+        """The number of steps and their initial size."""
 
         steps: Annotated[int, Field(ge=1, le=64)] = 4
         size: Annotated[float, Field(gt=0, le=3)] = Field(SIZE, description="size of every step before training")
@@ -30,9 +30,9 @@ class Unrolled(nn.Module):
         self.step_momenta = nn.Parameter(torch.full((steps,), MOMENTUM))
 
     def forward(self, eyes: Tensor) -> Tensor:
-        """Map intensities (n, 6, h, w) to panel values (n, 9, h, w), which are equal for all panels.
+        """Map intensities (n, 6, h, w) to panel values (n, 9, h, w) that are equal for all panels.
 
-        Each panel value is a third of the phase, between 1 and 2, at which the sum shows the mean picture.
+        Each panel value is a third of the phase sum, between 1 and 2, that shows the mean picture.
         """
         mean = (eyes[:, :3] + eyes[:, 3:]) / 2
         phase = torch.asin(mean.clamp(0, 1).sqrt()) * (2 / torch.pi)

@@ -1,7 +1,7 @@
 """Check that a model file meets the runtime's requirements and gives correct results.
 
-On export, the results are compared with those of the torch module. Those of an existing file are compared with the same
-graph without onnxruntime's optimisations, so every file that the runtime accepts can be checked.
+On export, the results are compared with the torch module's. An existing file's results are compared with those of the
+same graph run without onnxruntime's optimisations, so every file that the runtime accepts can be checked.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from runtime.support import untrusted_input
 from runtime.support.progress import tracked
 
 FILE_BYTES_MAX = 4 << 30  # maximum size of a model file
-LIMIT = 0.25 / 255  # maximum difference of panel values: a quarter of an 8-bit level
-SMALL = (96, 160)  # height and width of the pictures for a model without a fixed size
+LIMIT = 0.25 / 255  # maximum difference between panel values: a quarter of an 8-bit level
+SMALL = (96, 160)  # height and width of the test pictures for a model without a fixed size
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """Result of one check, with texts that say what was found and what is required."""
+    """The result of one check, with text that says what was found and what is required."""
 
     name: str
     found: str
@@ -43,7 +43,7 @@ class Check:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Results of all checks of a model file, as text or JSON."""
+    """The results of all checks on a model file, available as text or JSON."""
 
     file: str
     checks: tuple[Check, ...]
@@ -57,7 +57,7 @@ class Report:
         return json.dumps({"file": self.file, "passed": self.passed, "checks": [asdict(c) for c in self.checks]})
 
     def table(self) -> str:
-        """Return a readable table of the checks, each with the result and the requirement."""
+        """Return a readable table of the checks, each with its result and requirement."""
         rows = [f"{'ok' if c.passed else 'FAILED':8}{c.name}: {c.found}; wanted: {c.wanted}" for c in self.checks]
         failed = sum(not check.passed for check in self.checks)
         end = f"{failed} of {len(self.checks)} checks failed" if failed else f"all {len(self.checks)} checks passed"
@@ -79,12 +79,12 @@ def validate_file(path: Path) -> Report:
 
 
 def check_model(data: bytes, *, source: str, reference: Reference | None = None) -> Report:
-    """Check the results of a model against a reference.
+    """Check a model's results against a reference.
 
     Args:
-        data: Contents of the ONNX file.
-        source: Name of the file, for the report.
-        reference: Function that computes the correct results, such as the torch module. By default, it is the graph
+        data: The ONNX file's contents.
+        source: Name of the file, used in the report.
+        reference: Function that computes the correct results, such as the torch module. Defaults to the graph run
             without optimisations.
 
     Raises:
@@ -93,7 +93,7 @@ def check_model(data: bytes, *, source: str, reference: Reference | None = None)
     try:
         model = onnx.load_from_string(data)
         onnx.checker.check_model(model)
-    except Exception as error:  # the errors of protobuf and onnx
+    except Exception as error:  # errors from protobuf and onnx
         raise InputError(source, "", f"is not an ONNX model ({_said(error)})") from None
     contract = parse_contract({item.key: item.value for item in model.metadata_props}, source=source)
     checks = [Check("contract", f"{contract.arch} {contract.name}", f"version {VERSION}", True)]
@@ -114,9 +114,9 @@ def check_model(data: bytes, *, source: str, reference: Reference | None = None)
 
 
 def _size(shape: Sequence[Any], contract: Contract) -> tuple[int, int]:
-    """Return the height and the width of the test pictures.
+    """Return the test pictures' height and width.
 
-    They are those of the graph or of the contract. If neither fixes a size, they are `SMALL`.
+    They are taken from the graph or the contract. If neither fixes a size, `SMALL` is used.
     """
     graph, given = (*shape[2:], None, None)[:2], (contract.height_px, contract.width_px)
     found = [g if isinstance(g, int) else c or s for g, c, s in zip(graph, given, SMALL, strict=True)]
@@ -150,10 +150,10 @@ def _ports(session: onnxruntime.InferenceSession, contract: Contract) -> list[Ch
 
 
 def _panels(answer: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the outputs of a model as a vector of panel values, or a single NaN if its check failed.
+    """Return a model's outputs as a vector of panel values, or as a single NaN if its check failed.
 
     Integer outputs are in sixteenths of an 8-bit level, and floating-point outputs are panel values. A scalar output
-    that is not finite is a failed check.
+    that is not finite counts as a failed check.
     """
     if any(part.size == 1 and not np.isfinite(part).all() for part in answer):
         return np.full(1, np.nan, np.float32)
@@ -164,7 +164,7 @@ def _panels(answer: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _compared(name: str, run: Reference, reference: Reference, feeds: Feeds) -> Check:
-    """Run one input through both models, and check the shape, the values and their largest difference."""
+    """Run one input through both models, and check the shape, the values and the largest difference."""
     name = f"{'values' if name.startswith(ORDINARY) else 'drift'}, {name}"
     try:
         found = _panels(run(feeds))

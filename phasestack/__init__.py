@@ -1,4 +1,4 @@
-"""Public and stable Python interface of phasestack (docs/contracts.md, "From Python")."""
+"""phasestack's public, stable Python interface (docs/contracts.md, "From Python")."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Run the command `phasestack` as `python -m phasestack`."""
+"""Run the `phasestack` command as `python -m phasestack`."""
 
 from runtime.cli import main
 

@@ -1,7 +1,7 @@
-"""Import the packages `runtime`, `calib` and `model_export` of phasestack.
+"""Import phasestack's `runtime`, `calib` and `model_export` packages.
 
-They are loaded from phasestack's own folder, even if `sys.path` has other packages with these names. Raises ImportError
-if the program has already imported another module with one of these names.
+They are loaded from phasestack's own folder, even if `sys.path` contains other packages with these names. Raises
+ImportError if the program has already imported another module under one of these names.
 """
 
 from __future__ import annotations

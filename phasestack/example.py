@@ -1,4 +1,4 @@
-"""Example stereo pair, rendered by phasestack and free to use."""
+"""An example stereo pair, rendered by phasestack and free to use."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SCENE, EYES_M, FOV_DEG = "room", ((0.6, -0.0315, 0.03), (0.6, 0.0315, 0.03)), 40
 
 @dataclass(frozen=True)
 class ExamplePair:
-    """Stereo pair with the eye positions, the stack and the field of view for which it was rendered."""
+    """A stereo pair, with the eye positions, stack and field of view used to render it."""
 
     left: U8  # (360, 640, 3)
     right: U8  # (360, 640, 3)
@@ -41,7 +41,7 @@ class ExamplePair:
 
 
 def example_pair() -> ExamplePair:
-    """Return a rendered stereo pair of a scene that extends behind and in front of the panels."""
+    """Return a stereo pair rendered from a scene that extends behind and in front of the panels."""
     folder = Path(str(files("phasestack") / "data"))
     left, right = (read_image(folder / f"{side}.png") for side in ("left", "right"))
     stack = Stack(0.5184, 0.2916, (-0.06, 0.0, 0.06), width_px=left.shape[1], height_px=left.shape[0])

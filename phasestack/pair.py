@@ -1,4 +1,4 @@
-"""Solve pairs of pictures for a stack of panels, and measure the quality of arbitrary layers."""
+"""Solve pairs of pictures for a stack of panels, and measure the quality of any layers."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from runtime.support.artifacts import OutputFolder, write_json
 from runtime.support.progress import ShownProgress
 from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG, SEPARATION_MIN_M, refusal
 
-EVERY_LEAST = 20  # minimum number of sampled pixels along the shorter side of a picture
+EVERY_LEAST = 20  # minimum number of pixels to sample along a picture's shorter side
 SAME_PLACE_M = 0.001  # maximum distance between an eye and its camera
 _one_at_a_time = Lock()  # a loaded model reuses its buffers
 
@@ -46,9 +46,9 @@ Cameras = Sequence[Sequence[Sequence[float]]] | Sequence[F64] | F64
 
 @dataclass(frozen=True)
 class _Pair:
-    """Validated arguments of a call.
+    """A call's validated arguments.
 
-    The pictures are views of pinhole eyes that look at the stack's origin.
+    The pictures are views from pinhole eyes that look at the stack's origin.
     """
 
     pictures: tuple[Picture, ...]
@@ -58,25 +58,25 @@ class _Pair:
     is_resampled: bool  # True if the caller gave cameras
 
     def judged(self, layers: U8) -> SolvedPair:
-        """Combine layers with this request, to compute what each eye sees of the layers and how good it is."""
+        """Combine layers with this request, to compute what each eye sees of them and how good it is."""
         return SolvedPair(layers, self.pictures, self.stack, self.eyes_m, self.fov_deg)
 
 
 class Measuring(TypedDict, total=False):
-    """Options that make a measurement of quality faster."""
+    """Options that make a quality measurement faster."""
 
     sigmas_mm: Sequence[float]  # tracking errors to evaluate; each except 0 takes four more measurements
     every: int  # measure every Nth pixel of every Nth row; 1 measures all pixels
 
 
 class Result:
-    """Layers that were computed for a pair of pictures.
+    """The layers computed for a pair of pictures.
 
     The result can also show what each eye sees of the layers, measure the quality, and save everything to files.
     """
 
     layers: U8  # (panels, h, w, 3), rear to front
-    model: str  # name of the model that was used, with a note if its network does not support the stack
+    model: str  # name of the model used, with a note if its network does not support the stack
     eye_sigma_mm: float  # tracking error that the layers were computed for
     total_ms: float  # time the solver took, without loading the model
 
@@ -90,17 +90,17 @@ class Result:
 
     @property
     def quality(self) -> PairQuality:
-        """Quality of what the eyes see, relative to the pictures they should see.
+        """Quality of what the eyes see, compared with the pictures they should see.
 
-        The quality is measured on first access, which may take longer than solving. A warning is issued for each of
-        the `notes`.
+        The quality is measured on first access, which may take longer than solving. A warning is issued for each entry
+        in `notes`.
         """
         self._warn()
         return self._pair.quality
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
-        """Warnings that the eyes will see ghosts because the pictures have too much disparity for the stack."""
+        """Warnings that the eyes will see ghosts, because the pictures have too much disparity for the stack."""
         asked = self._asked
         return tuple(
             disparity_doubts(
@@ -109,10 +109,10 @@ class Result:
         )
 
     def measure(self, **how: Unpack[Measuring]) -> PairQuality:
-        """Measure the quality with options that make it faster, such as `measure(sigmas_mm=(1,), every=4)`.
+        """Measure the quality, with options to make it faster, such as `measure(sigmas_mm=(1,), every=4)`.
 
         Args:
-            **how: The options of `Measuring`, as in `evaluate`.
+            **how: Options defined in `Measuring`, as for `evaluate`.
 
         Raises:
             ValueError: An option is out of range. The message names the option.
@@ -126,7 +126,7 @@ class Result:
 
     @property
     def seen(self) -> U8:
-        """Simulated views (2, h, w, 3) of the eyes through the layers, with the left eye first."""
+        """The eyes' simulated views through the layers, as a (2, h, w, 3) array with the left eye first."""
         return np.stack(self._pair.seen)
 
     @cached_property
@@ -139,10 +139,10 @@ class Result:
         return line + f"one ray a pixel, as published: {self._pair.quality.psnr_db:.1f} dB"
 
     def show(self) -> Path:
-        """Open an HTML page that shows the layers and the eyes' views in a browser.
+        """Open a browser page that shows the layers and the eyes' views.
 
         Returns:
-            The path of the HTML file. The file is temporary, but is not deleted automatically.
+            The path to the HTML file. The file is temporary, but is not deleted automatically.
         """
         path = Path(tempfile.mkdtemp(prefix="phasestack-")) / "viewer.html"
         path.write_text(self._pair.viewer([self._line, *self.notes]), encoding="utf-8")
@@ -150,14 +150,14 @@ class Result:
         return path
 
     def _repr_html_(self) -> str:
-        """Return the viewer page as an HTML element, which notebooks display."""
+        """Return the viewer page as an HTML element, for notebooks to display."""
         page = html.escape(self._pair.viewer([self._line, *self.notes]))
         return f'<iframe srcdoc="{page}" style="width: 100%; height: 640px; border: 0"></iframe>'
 
     def save(self, out: str | Path) -> None:
         """Write the layers, the eyes' views, a contact sheet, a viewer page and solve.json to a folder.
 
-        The files are the same as those that `phasestack solve --out` writes.
+        The files are the same as those written by `phasestack solve --out`.
         """
         with OutputFolder(Path(out)) as folder:
             self._pair.write(folder.staging, lines=[self._line, *self.notes])
@@ -185,20 +185,20 @@ def solve(
         left: Picture for the left eye: an array (h, w, 3 or 4) of uint8 or of floats in 0..1, or a Pillow image. It
             must be taken by a pinhole camera at the eye that looks at the stack's origin without roll.
         right: Picture for the right eye, of the same size.
-        stack: Geometry of the panels.
-        eyes_m: Positions of the left and the right eye in metres, in the frame `stack` (+x out of the screen, +y to
-            the viewer's right, +z up). Required unless `cameras` is given.
-        fov_deg: Horizontal field of view of the pictures, in degrees.
-        cameras: Two 3x4 matrices for pictures that were taken by other pinhole cameras, such as parallel or shifted
-            ones. A matrix maps homogeneous metres in the frame `stack` to homogeneous pixels, with +u right, +v down
-            and pixel centres at half-integers. It is K·[R | t] with OpenCV's axes; add half a pixel to the principal
-            point if K assumes pixel centres at integers. The cameras replace `eyes_m` and `fov_deg`: the pictures are
-            resampled to look at the stack's origin and to cover the panels before they are solved and measured.
-        model: `fast`, `balanced`, `best`, `sart`, or the path of an ONNX file.
+        stack: Panel geometry.
+        eyes_m: Left and right eye positions in metres, in the `stack` frame (+x out of the screen, +y to the viewer's
+            right, +z up). Required unless `cameras` is given.
+        fov_deg: The pictures' horizontal field of view, in degrees.
+        cameras: Two 3x4 matrices for pictures taken by other pinhole cameras, such as parallel or shifted ones. Each
+            matrix maps homogeneous metres in the `stack` frame to homogeneous pixels, with +u right, +v down and pixel
+            centres at half-integers. It is K·[R | t] with OpenCV's axes; add half a pixel to the principal point if K
+            assumes pixel centres at integers. The cameras replace `eyes_m` and `fov_deg`: the pictures are resampled to
+            look at the stack's origin and to cover the panels before they are solved and measured.
+        model: `fast`, `balanced`, `best`, `sart`, or the path to an ONNX file.
         eye_sigma_mm: Tracking error to allow for: 1 suits a good tracker, and 0 assumes exact positions.
 
     Raises:
-        ValueError: An argument is invalid. The message begins with the name of the argument.
+        ValueError: An argument is invalid. The message begins with the argument's name.
     """
     pair = _checked((left, right), stack=stack, eyes_m=eyes_m, fov_deg=fov_deg, cameras=cameras)
     eye_sigma_mm = _number("eye_sigma_mm", eye_sigma_mm, 0.0, 1000.0, "mm")
@@ -233,16 +233,16 @@ def solve_each(
     eye_sigma_mm: float = 1.0,
     progress: bool = True,
 ) -> Iterator[Result]:
-    """Solve many pairs one after another, and yield the result of each.
+    """Solve many pairs one after another, and yield each pair's result.
 
     Args:
         pairs: Tuples (left picture, right picture, eyes_m) as in `solve`. Each pair is read only when its turn comes,
             so `pairs` may be a generator.
-        stack: Geometry of the panels.
-        fov_deg: Horizontal field of view of all pictures, in degrees.
+        stack: Panel geometry.
+        fov_deg: All pictures' horizontal field of view, in degrees.
         model: Model as in `solve`.
         eye_sigma_mm: Tracking error to allow for, as in `solve`.
-        progress: Show the progress on stderr.
+        progress: Show progress on stderr.
 
     Raises:
         ValueError: An argument is invalid. The message names the pair and the argument.
@@ -275,24 +275,24 @@ def evaluate(
     cameras: Cameras | None = None,
     **how: Unpack[Measuring],
 ) -> PairQuality:
-    """Measure how well arbitrary layers show each eye its picture.
+    """Measure how well any layers show each eye its picture.
 
     Args:
-        layers: Array (panels, h, w, 3 or 4) from rear to front, at the resolution of the stack, of uint8 or of floats
-            in 0..1. A panel value v rotates the polarization by v·90 degrees, and an eye sees sin² of the sum of the
-            angles along a ray. Floats are rounded to the 8 bits of a panel.
+        layers: Array (panels, h, w, 3 or 4) from rear to front, at the stack's resolution, of uint8 or of floats in
+            0..1. A panel value v rotates the polarization by v·90 degrees, and an eye sees sin² of the sum of the
+            angles along a ray. Floats are rounded to a panel's 8 bits.
         left: Picture that the left eye should see, as in `solve`.
         right: Picture that the right eye should see, as in `solve`.
-        stack: Geometry of the panels.
-        eyes_m: Positions of the eyes, as in `solve`.
-        fov_deg: Horizontal field of view of the pictures, in degrees.
-        cameras: Cameras of the pictures, as in `solve`.
-        **how: Options that make the measurement faster. `evaluate(..., sigmas_mm=(1,), every=4)` measures only this
-            tracking error, at every 4th pixel of every 4th row, and adds the standard error of the light PSNR. SSIM
-            is then NaN.
+        stack: Panel geometry.
+        eyes_m: Eye positions, as in `solve`.
+        fov_deg: The pictures' horizontal field of view, in degrees.
+        cameras: The pictures' cameras, as in `solve`.
+        **how: Options that make the measurement faster. `evaluate(..., sigmas_mm=(1,), every=4)` measures only a
+        tracking error of 1 mm, at every 4th pixel of every 4th row, and also gives the light PSNR's standard error.
+        SSIM is then NaN.
 
     Raises:
-        ValueError: An argument is invalid. The message begins with the name of the argument.
+        ValueError: An argument is invalid. The message begins with the argument's name.
     """
     pair = _checked((left, right), stack=stack, eyes_m=eyes_m, fov_deg=fov_deg, cameras=cameras)
     given = as_array("layers", layers)
@@ -311,7 +311,7 @@ def evaluate(
 
 
 def _measured(pair: SolvedPair, how: Measuring) -> PairQuality:
-    """Measure all figures of quality, or only those that the options request.
+    """Measure all quality figures, or only those requested by the options.
 
     Raises:
         TypeError: An option does not exist.
@@ -332,20 +332,19 @@ def _measured(pair: SolvedPair, how: Measuring) -> PairQuality:
 
 
 def camera(eye_m: Sequence[float] | F64, *, width_px: int, height_px: int, fov_deg: float = 40.0) -> F64:
-    """Return the matrix (3, 4) of the pinhole camera that `solve` assumes at an eye by default.
+    """Return the 3x4 matrix of the pinhole camera that `solve` assumes at an eye by default.
 
-    The camera looks at the stack's origin, and its rows of pixels are parallel to the ground. The matrix maps
-    homogeneous metres in the frame `stack` to homogeneous pixels, whose third coordinate is the distance along the
-    gaze in metres.
+    The camera looks at the stack's origin, and its pixel rows are parallel to the ground. The matrix maps homogeneous
+    metres in the `stack` frame to homogeneous pixels; their third coordinate is the distance along the gaze, in metres.
 
     Args:
-        eye_m: Position of the eye in metres, in the frame `stack`.
-        width_px: Width of the picture.
-        height_px: Height of the picture.
-        fov_deg: Horizontal field of view in degrees.
+        eye_m: The eye's position in metres, in the `stack` frame.
+        width_px: Picture width.
+        height_px: Picture height.
+        fov_deg: Horizontal field of view, in degrees.
 
     Raises:
-        ValueError: An argument is invalid. The message begins with the name of the argument.
+        ValueError: An argument is invalid. The message begins with the argument's name.
     """
     sizes = {"width_px": width_px, "height_px": height_px}
     for name, size in sizes.items():
@@ -359,20 +358,20 @@ def camera(eye_m: Sequence[float] | F64, *, width_px: int, height_px: int, fov_d
 def project(
     points_m: ArrayLike, *, eye_m: Sequence[float] | F64, width_px: int, height_px: int, fov_deg: float = 40.0
 ) -> F64:
-    """Project points to the pixels of an eye's picture.
+    """Project points to pixels in an eye's picture.
 
     Args:
-        points_m: Points (..., 3) in metres, in the frame `stack`.
-        eye_m: Position of the eye in metres, in the frame `stack`.
-        width_px: Width of the picture.
-        height_px: Height of the picture.
-        fov_deg: Horizontal field of view in degrees.
+        points_m: Points (..., 3) in metres, in the `stack` frame.
+        eye_m: The eye's position in metres, in the `stack` frame.
+        width_px: Picture width.
+        height_px: Picture height.
+        fov_deg: Horizontal field of view, in degrees.
 
     Returns:
-        Pixel coordinates (..., 2). The coordinates of points behind the eye are NaN.
+        Pixel coordinates (..., 2), or NaN for points behind the eye.
 
     Raises:
-        ValueError: An argument is invalid. The message begins with the name of the argument.
+        ValueError: An argument is invalid. The message begins with the argument's name.
     """
     points = np.asarray(points_m, np.float64)
     if points.ndim < 1 or points.shape[-1] != 3:
@@ -391,7 +390,7 @@ def _checked(
     fov_deg: float,
     cameras: Cameras | None,
 ) -> _Pair:
-    """Validate the arguments of `solve`, and resample pictures that other cameras took.
+    """Validate the arguments of `solve`, and resample pictures taken by other cameras.
 
     Raises:
         ValueError: An argument is invalid, or an eye sees no part of the display. The message names the argument.
@@ -444,11 +443,11 @@ def _loaded(model: str, stack: PanelStack) -> Predictor:
 
 
 def _eyes(eyes_m: Any, stack: PanelStack) -> F64:
-    """Return the eyes as an array (2, 3).
+    """Return the eyes as a (2, 3) array.
 
     Raises:
-        ValueError: The eyes are not two points of three finite numbers, are too far away, are not in front of the
-            panels, or are less than 5 mm apart.
+        ValueError: The eyes are not two points with three finite numbers each, are too far away, are not in front of
+            the panels, or are less than 5 mm apart.
     """
     try:
         eyes = np.asarray(eyes_m, np.float64)

@@ -1,4 +1,4 @@
-"""Convert pictures from arrays, tensors and Pillow images, and find the eyes in a picture."""
+"""Convert arrays, tensors and Pillow images to pictures, and find the eyes in a picture."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from runtime.support.picture_file import rgb_of
 
 LEAST_PX = 16
 SLACK = 1e-3  # tolerance for rounding errors: a quarter of an 8-bit level
-OVERSHOOT = 0.3  # fraction of white by which resampled values may exceed the range
+OVERSHOOT = 0.3  # how far resampled values may lie outside the range, as a fraction of white
 
 
 def as_picture(name: str, given: Any) -> Picture:
-    """Convert a picture to an array (h, w, 3) of uint8, or of float32 in [0, 1].
+    """Convert a picture to an (h, w, 3) array of uint8, or of float32 in [0, 1].
 
     An alpha channel is composited over white.
 
     Args:
-        name: Name of the caller's argument, for error messages.
+        name: Name of the caller's argument, used in error messages.
         given: An array, a tensor, or a Pillow image in any mode.
 
     Raises:
-        ValueError: The shape, the dtype or the values are not those of a picture. The message suggests a conversion.
+        ValueError: The shape, dtype or values are not those of a picture. The message suggests a conversion.
     """
     picture: Any = _from_pillow(name, given) if hasattr(given, "getbands") else as_array(name, given)
     if picture.ndim != 3 or picture.shape[2] not in (3, 4) or min(picture.shape[:2]) < LEAST_PX:
@@ -83,7 +83,7 @@ def _from_pillow(name: str, image: Any) -> U8:
         return rgb_of(image, name)
     except InputError as error:
         raise ValueError(str(error)) from None
-    except OSError as error:  # Pillow notices a truncated file only when its pixels are read
+    except OSError as error:  # Pillow notices that a file is truncated only when its pixels are read
         raise ValueError(f"{name}: cannot be decoded ({error})") from None
 
 
@@ -122,15 +122,15 @@ def as_codes(picture: Picture) -> U8:
 
 
 def find_eyes(picture: ArrayLike) -> Pupils | None:
-    """Find the pupils of the nearest viewer in a picture.
+    """Find the nearest viewer's pupils in a picture.
 
     Args:
         picture: Array (h, w, 3 or 4) of uint8 or of floats in 0..1, or a Pillow image.
 
     Returns:
-        The pupils, or None if the picture shows no viewer. `eyes_px` is an array (2, 2) of pixel coordinates, where
-        pixel centres are at half-integers. The viewer's left eye comes first and is on the right in a picture that is
-        not mirrored. `sigma_px` is the standard deviation of one coordinate.
+        The pupils, or None if the picture shows no viewer. `eyes_px` is a (2, 2) array of pixel coordinates, with pixel
+        centres at half-integers. The viewer's left eye comes first; in a picture that is not mirrored, it is on the
+        right. `sigma_px` is the standard deviation of each coordinate.
 
     Raises:
         ValueError: The argument is not a picture.

@@ -1,4 +1,4 @@
-"""Geometry of a display, with validated arguments."""
+"""A display's geometry, with validated arguments."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from runtime.optics.stack import PanelStack, Tilt
 
 
 class Stack(PanelStack):
-    """Geometry of a display whose parallel panels have the same size and are centred on the x axis.
+    """Geometry of a display whose parallel panels are all the same size and centred on the x axis.
 
     Attributes:
         width_m: Width of a panel's picture area in metres.
         height_m: Height of a panel's picture area in metres.
-        x_m: Positions of the panels along the x axis in metres, ascending from the rear panel to the front panel.
-        width_px: Columns of pixels of a panel.
-        height_px: Rows of pixels of a panel.
-        tilt: Deviation of the panels from parallel planes, as measured by a calibration.
+        x_m: The panels' positions along the x axis in metres, ascending from the rear panel to the front panel.
+        width_px: Number of pixel columns on each panel.
+        height_px: Number of pixel rows on each panel.
+        tilt: The panels' deviation from parallel planes, as measured by a calibration.
     """
 
     __slots__ = ()

@@ -1,4 +1,4 @@
-"""Sphinx: `make site` builds README, the pages of docs/ and the API from docstrings into out/site."""
+"""Sphinx: `make site` builds README, docs/ and an API reference from the docstrings into out/site."""
 
 project = "phasestack"
 author = "the phasestack authors"
@@ -27,7 +27,7 @@ html_css_files = ["site.css"]
 templates_path: list[str] = []
 myst_heading_anchors = 3
 myst_enable_extensions = ["deflist"]
-# Code without a language is a shell's or Python's: it is shown verbatim.
+# Code blocks without a language contain shell commands or Python; they are shown verbatim.
 highlight_language = "none"
 # Names in docstrings have single backticks; `--out` keeps both dashes.
 default_role = "code"

@@ -1,1 +1,1 @@
-"""Evaluation of runs and solutions: displayed quality, output files and the contact sheet."""
+"""Evaluate runs and solutions: displayed quality, output files and the contact sheet."""

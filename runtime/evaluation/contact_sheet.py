@@ -1,4 +1,4 @@
-"""Draw contact sheets, which show the layers and each eye's target, retina image and error."""
+"""Draw contact sheets that show the layers and each eye's target, retina image and error."""
 
 from __future__ import annotations
 
@@ -18,39 +18,40 @@ from runtime.records import F32, F64, U8
 
 TILE_WIDTH = 640  # pixels
 MARGIN = 12  # pixels
-LINE_LETTERS = 58  # number of letters in a line under the headline, per tile of the sheet's width
+LINE_LETTERS = 58  # number of letters per line under the headline, for each tile of the sheet's width
 HEADLINE, TITLE = 52, 34  # heights in pixels
-ERROR_GAIN = 8  # amplification of the error pictures
-INK = (40, 40, 40)  # colour of text
-PAPER = 246  # grey level of the background
+ERROR_GAIN = 8  # amplification factor for the error pictures
+INK = (40, 40, 40)  # text colour
+PAPER = 246  # background grey level
 
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """Measured refresh of a run, with the pictures for the contact sheet and the viewer page.
+    """A measured refresh from a run, with the pictures for the contact sheet and the viewer page.
 
-    The contact sheet shows the layers after alignment, and the viewer page shows the solution before alignment.
+    The contact sheet shows the layers after alignment; the viewer page shows the solution before alignment.
     """
 
-    layers: U8  # (N, h, w, 3 or 4) layers as the panels showed them, after alignment
+    layers: U8  # (N, h, w, 3 or 4) layers as shown by the panels, after alignment
     eye_views: EyeViews
     light_db: float  # light PSNR for a tracking error of 1 mm
-    lines: tuple[str, ...]  # text that states the number of the refresh and how far the eyes had moved
+    lines: tuple[str, ...]  # text that states the refresh number and how far the eyes had moved
     solution: U8  # (N, h, w, 3 or 4) layers before alignment
-    solved_for_m: F64  # (2, 3) eyes that the solution was computed for, frame `stack`
-    asked_for: tuple[U8, ...]  # (h, w, 3) targets of the solution
+    solved_for_m: F64  # (2, 3) eyes the solution was computed for, frame `stack`
+    asked_for: tuple[U8, ...]  # (h, w, 3) the solution's targets
     relief: F32 | None = None  # (h, w) relief of the solution's content (`optics.relief`)
 
 
 def contact_sheet(layers: U8, eye_views: EyeViews | None, *, headline: str, lines: Sequence[str] = ()) -> U8:
-    """Draw a contact sheet, and return the RGB picture, shape (h, w, 3).
+    """Draw a contact sheet, and return it as an RGB picture, shape (h, w, 3).
 
-    The first row shows the layers. Then follows a row for each eye with the target, the retina image and the error.
+    The first row shows the layers. It is followed by a row for each eye, with the target, the retina image and the
+    error.
 
     Args:
         layers: Layers from rear to front, shape (N, H, W, 3 or 4).
-        eye_views: Retina images and targets, or None for a sheet without rows for the eyes.
-        headline: Sentence at the top, which states the figure to quote.
+        eye_views: Retina images and targets, or None to leave out the eyes' rows.
+        headline: Sentence at the top that states the figure to quote.
         lines: Lines of text below the headline. Long lines are wrapped.
     """
     height, width = layers.shape[1:3]
@@ -88,7 +89,7 @@ def contact_sheet(layers: U8, eye_views: EyeViews | None, *, headline: str, line
 
 
 def headline(light_db: float | None) -> str:
-    """Return the headline of a contact sheet, which states the light PSNR and its conditions.
+    """Return a contact sheet's headline, which states the light PSNR and the conditions it applies to.
 
     Args:
         light_db: Light PSNR for a tracking error of 1 mm, or None or NaN if it was not measured.

@@ -22,33 +22,33 @@ from runtime.support.artifacts import write_png
 from runtime.support.threads import parallel_map
 
 Picture = U8 | F32  # (h, w, 3), code values or intensities in [0, 1]
-SIGMAS_MM = (0.0, 1.0, 2.0)  # tracking errors: none, that of a good tracker, and twice that of a good tracker
+SIGMAS_MM = (0.0, 1.0, 2.0)  # tracking errors: none, a good tracker's, and twice a good tracker's
 
 
 @dataclass(frozen=True, slots=True)
 class EyeViews:
-    """Images that both eyes see through the layers, with the target pictures and the measured quality."""
+    """The images both eyes see through the layers, with the target pictures and the measured quality."""
 
-    seen: tuple[Retina, ...]  # images of the left and right eye
-    wanted: tuple[Picture, ...]  # targets of the left and right eye
-    quality: Quality  # measured exactly at the eyes that the layers were solved for or aligned to
+    seen: tuple[Retina, ...]  # the left and right eyes' images
+    wanted: tuple[Picture, ...]  # the left and right eyes' targets
+    quality: Quality  # measured exactly at the eyes the layers were solved for or aligned to
     stack: PanelStack
     eyes_m: F64  # (2, 3) left and right eye, frame `stack`
-    fov_deg: float  # horizontal field of view of images and targets
+    fov_deg: float  # horizontal field of view of the images and targets
 
     def viewer(self, layers: U8, text: Sequence[str], *, relief: F32 | None = None) -> str:
-        """Return a viewer page in HTML for layers that were solved for the eyes `eyes_m`.
+        """Return an HTML viewer page for layers that were solved for the eyes `eyes_m`.
 
         Args:
             layers: Layers from rear to front, shape (N, h, w, 3 or 4).
-            text: Title of the page, followed by lines of text.
-            relief: Relief of the layers' content, shape (h, w) (`optics.relief`).
+            text: The page's title, followed by lines of text.
+            relief: Relief of the content in the layers, shape (h, w) (`optics.relief`).
         """
         wanted, eyes_m = [as_codes(intensities(picture)) for picture in self.wanted], np.asarray(self.eyes_m)
         return viewer_html(layers, wanted, self.stack, eyes_m=eyes_m, fov_deg=self.fov_deg, text=text, relief=relief)
 
     def write(self, folder: Path) -> None:
-        """Write the images and targets as `seen-left.png`, `wanted-left.png` and so on into a folder."""
+        """Write the images and targets to a folder as `seen-left.png`, `wanted-left.png` and so on."""
 
         def write(side: int) -> None:
             eye = ("left", "right")[side]
@@ -61,17 +61,17 @@ class EyeViews:
 def displayed(
     layers: U8, wanted: Sequence[Picture], stack: PanelStack, *, eyes_m: F64, fov_deg: float, similarity: bool = True
 ) -> EyeViews:
-    """Compute the images that two eyes see through layers, and compare the images with targets.
+    """Compute the images that two eyes see through layers, and compare them with targets.
 
-    Targets with the aspect ratio of the panels are compared at the panels' resolution. Other targets keep their
-    resolution unless they have more pixels than a panel, in which case they are reduced.
+    Targets with the panels' aspect ratio are compared at the panels' resolution. Other targets keep their resolution,
+    unless they have more pixels than a panel, in which case they are reduced.
 
     Args:
         layers: Layers from rear to front, shape (N, H, W, 3 or 4).
-        wanted: Target picture of each eye.
-        stack: Geometry of the panels.
-        eyes_m: Left and right eye, shape (2, 3), frame `stack`.
-        fov_deg: Horizontal field of view of the targets.
+        wanted: Each eye's target picture.
+        stack: Panel geometry.
+        eyes_m: Left and right eyes, shape (2, 3), in the `stack` frame.
+        fov_deg: The targets' horizontal field of view.
         similarity: Compute SSIM. If False, SSIM is NaN.
 
     Raises:
@@ -88,9 +88,9 @@ def displayed(
 
 
 class Expected(NamedTuple):
-    """Expected PSNR (docs/contracts.md, Error) by tracking error in mm, such as "0", "1" and "2"."""
+    """Expected PSNR (docs/contracts.md, Error), keyed by tracking error in mm, such as "0", "1" and "2"."""
 
-    db: dict[str, float]  # NaN if the tracking error moves an eye so far that the eye sees no part of the panels
+    db: dict[str, float]  # NaN if the tracking error moves an eye so far that it sees no part of the panels
     standard_error_db: dict[str, float]  # estimated from groups of rows; empty if the sampling has no groups
 
 
@@ -102,7 +102,7 @@ def expected_quality(
     Args:
         eye_views: Targets, eyes and geometry.
         layers: Layers from rear to front, shape (N, H, W, 3 or 4).
-        sampling: Rays to trace. By default, the measured quality is light (`expected_errors`).
+        sampling: Rays to trace. By default, light is measured (`expected_errors`).
         sigmas_mm: Tracking errors.
     """
     groups = sampling.groups if sampling else 0
@@ -125,8 +125,8 @@ def expected_quality(
 def on_panels_raster(picture: Picture, stack: PanelStack) -> Picture:
     """Resample a picture to the panels' resolution.
 
-    A picture with a different aspect ratio keeps its aspect ratio, and is reduced if it has more pixels than a panel.
-    Panels cannot show finer detail, and measuring finer detail would take time and memory.
+    A picture with a different aspect ratio keeps it, and is reduced if it has more pixels than a panel. Panels cannot
+    show finer detail, and measuring it would cost time and memory.
     """
     height_px, width_px = picture.shape[:2]
     size = (stack.width_px, stack.height_px)

@@ -1,7 +1,7 @@
-"""Write recordings of benchmark motions that include the true eyes, for `phasestack record --motion`.
+"""Write recordings of benchmark motions, including the true eyes, for `phasestack record --motion`.
 
-The summary of a run that replays such a recording can state the quality at the true eyes. The pose of the simulated
-sensor agrees with the demo calibration, which a run uses by default.
+When a run replays such a recording, its summary can state the quality at the true eyes. The simulated sensor's pose
+matches the demo calibration, which runs use by default.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from runtime.sensor.recording import recording_to
 from runtime.sensor.recording_format import RecordingHeader
 
 SECONDS, RATE_HZ, NOISE_MM = 12.0, 30.0, 3.0
-SECONDS_MAX = 3600.0  # maximum length of a recording, which is built in memory
+SECONDS_MAX = 3600.0  # maximum length of a recording; recordings are built in memory
 
 
 def write_motion(
@@ -32,15 +32,15 @@ def write_motion(
     rate_hz: float = RATE_HZ,
     noise_mm: float = NOISE_MM,
 ) -> dict[str, Any]:
-    """Write a recording of a motion, and return a description of the recording.
+    """Write a recording of a motion, and return a description of it.
 
     Args:
         path: File to write.
-        motion: Name of the motion, a key of `MOTIONS`.
-        seed: Seed of the path and the noise. 0 selects those of the benchmark.
-        seconds: Length of the recording.
+        motion: Name of the motion: a key in `MOTIONS`.
+        seed: Seed for the path and the noise. 0 selects the benchmark's.
+        seconds: Duration of the recording.
         rate_hz: Number of samples per second.
-        noise_mm: Standard deviation of the noise of the sampled positions.
+        noise_mm: Standard deviation of the noise in the sampled positions.
 
     Raises:
         InputError: The motion is unknown, the length is out of range, or the file cannot be written.

@@ -1,4 +1,4 @@
-"""Measure the quality of a refresh at the eyes that it was aligned to and, live, at the true eyes."""
+"""Measure a refresh's quality at the eyes it was aligned to and, live, at the true eyes."""
 
 from __future__ import annotations
 
@@ -17,47 +17,47 @@ from runtime.records import F64, U8, RefreshAccount
 
 log = logging.getLogger("phasestack.quality")
 
-# Sampling of light. The errors of a displaced view are at edges. If only a quarter of a small picture's pixels are
+# How light is sampled. A displaced view has its errors at edges, so if only a quarter of a small picture's pixels are
 # sampled, the measured live quality is off by 0.6 dB.
 ALIGNED, LIVE = Sampling(step=2), Sampling(rays=4)
 ALIGNED_LARGE, LIVE_LARGE = Sampling(step=4), Sampling(step=2)  # for pictures with more values than `PLENTY`
 FIGURES = ("light_db", "psnr_db", "ssim", "carried_db", "psnr_db_true_eyes", "carried_db_true_eyes")
-Pictures = tuple[U8, U8]  # (h, w, 3) pictures for the left and right eye, at the resolution of a panel
+Pictures = tuple[U8, U8]  # (h, w, 3) pictures for the left and right eyes, at a panel's resolution
 
 
 @dataclass(frozen=True, slots=True)
 class RefreshTargets:
-    """Target pictures against which a refresh is measured. Pictures that were not drawn are None."""
+    """Target pictures to measure a refresh against. Pictures that were not drawn are None."""
 
-    fov_deg: float  # horizontal field of view of all pictures
-    solved: Pictures | None = None  # content at the solution's instant, for the eyes that it was solved for
-    used: Pictures | None = None  # content at the solution's instant, for the eyes that the layers were aligned to
+    fov_deg: float  # all pictures' horizontal field of view
+    solved: Pictures | None = None  # content at the solution's instant, for the eyes it was solved for
+    used: Pictures | None = None  # content at the solution's instant, for the eyes the layers were aligned to
     true: Pictures | None = None  # content at the display time, for the true eyes
 
 
 @dataclass(frozen=True, slots=True)
 class RefreshQuality:
-    """Measurements of one refresh, and the pictures for its contact sheet."""
+    """Measurements from one refresh, and the pictures for its contact sheet."""
 
-    figures: dict[str, float] = field(default_factory=dict)  # measured values by name (FIGURES)
-    live_error: float | None = None  # mean squared error of light at the true eyes
+    figures: dict[str, float] = field(default_factory=dict)  # measured values, keyed by name (FIGURES)
+    live_error: float | None = None  # mean squared error of the light at the true eyes
     moment: Moment | None = None  # pictures for the contact sheet and the viewer page
 
 
 def view_error_mm(eyes_m: F64, solved_for_m: F64) -> float:
-    """Return the distance in millimetres between the midpoints of two pairs of eyes, shapes (2, 3)."""
+    """Return the distance, in millimetres, between the midpoints of two pairs of eyes, each (2, 3)."""
     return 1000 * float(np.linalg.norm((eyes_m - solved_for_m).mean(axis=0)))
 
 
 def live_error(layers: U8, targets: Pictures, stack: PanelStack, *, eyes_m: F64, fov_deg: float) -> float:
-    """Return the mean squared error of light at two eyes.
+    """Return the mean squared error of the light at two eyes.
 
     Args:
-        layers: Layers as the panels show them, shape (N, H, W, 3 or 4).
+        layers: Layers as shown by the panels, shape (N, H, W, 3 or 4).
         targets: Pictures that the eyes should see.
-        stack: Geometry of the panels.
-        eyes_m: Left and right eye, shape (2, 3), frame `stack`.
-        fov_deg: Horizontal field of view of the targets.
+        stack: Panel geometry.
+        eyes_m: Left and right eyes, shape (2, 3), in the `stack` frame.
+        fov_deg: The targets' horizontal field of view.
 
     Raises:
         ValueError: The eyes see no part of the panels.
@@ -73,17 +73,17 @@ def live_error(layers: U8, targets: Pictures, stack: PanelStack, *, eyes_m: F64,
 def measure_refresh(
     account: RefreshAccount, layers: U8, carried: tuple[U8, U8] | None, targets: RefreshTargets, stack: PanelStack
 ) -> RefreshQuality:
-    """Measure the quality of a refresh for all targets that were drawn.
+    """Measure a refresh's quality for all targets that were drawn.
 
-    A measurement is omitted if the eyes see no part of the panels.
+    Measurements are omitted if the eyes see no part of the panels.
 
     Args:
-        account: Record of the refresh. Live quality requires the true eyes in this record.
-        layers: Layers as the panels showed them, shape (N, h, w, 4).
-        carried: The layers aligned as if all content were on the middle panel, and the layers before alignment. None
-            if the panels did not show a solution alone.
+        account: The refresh's record. Live quality is measured only if it contains the true eyes.
+        layers: Layers as shown by the panels, shape (N, h, w, 4).
+        carried: The layers aligned as if all content were on the middle panel, and the layers before alignment. None if
+            the panels were not showing a solution on its own.
         targets: Target pictures.
-        stack: Geometry of the panels.
+        stack: Panel geometry.
     """
     error = None
     if targets.true is not None and account.true_eyes_m is not None:
@@ -138,7 +138,7 @@ def _at_aligned_eyes(
 
 
 def _line(account: RefreshAccount) -> str:
-    """Return the line of the contact sheet that states the number and the view error of the refresh."""
+    """Return the contact sheet's line that states the refresh's number and view error."""
     assert account.eyes_m is not None and account.solved_for_m is not None
     moved_mm = view_error_mm(account.eyes_m, account.solved_for_m)
     return (

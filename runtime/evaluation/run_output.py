@@ -1,4 +1,4 @@
-"""Write the output files of a run (docs/contracts.md). A failed write does not stop the run."""
+"""Write a run's output files (docs/contracts.md). A failed write does not stop the run."""
 
 from __future__ import annotations
 
@@ -21,33 +21,33 @@ from runtime.support.threads import fresh_threads, parallel_map
 log = logging.getLogger("phasestack.output")
 
 Work = Callable[[], object]
-WAITING = 4096  # maximum number of queued jobs, which is a minute of lines
-WAITING_PICTURES = 4  # maximum number of queued jobs with a refresh's pictures, which take 25 MB each at 1080p
+WAITING = 4096  # maximum number of queued jobs, enough for a minute of lines
+WAITING_PICTURES = 4  # maximum number of queued jobs that hold a refresh's pictures, which take 25 MB per job at 1080p
 
 
 class RunOutput:
-    """Writer of a run's files to a folder, where all files appear together after a clean exit.
+    """Writer that puts a run's files in a folder, where they all appear together after a clean exit.
 
-    A background thread writes the files, which keeps refreshes from waiting for the disk. If the disk fails during the
-    run (full, gone, permission lost), the files are discarded and the run continues. The reason is logged once and
-    kept in `problem`.
+    A background thread writes the files, so that refreshes do not wait for the disk. If the disk fails during the run
+    (full, gone, permission lost), the files are discarded and the run continues. The reason is logged once and kept in
+    `problem`.
     """
 
     def __init__(self, target: Path, *, every_one: bool = True) -> None:
-        """Create a writer, which has to be entered as a context manager before use.
+        """Create a writer, which must be entered as a context manager before use.
 
         Args:
-            target: Folder for the files.
+            target: Folder to write the files to.
             every_one: Wait for a slow disk. If False, drop lines and pictures that the disk is too slow for.
         """
         self._folder = OutputFolder(target)
         self._target, self._every_one = target, every_one
         self._lines: TextIO | None = None
-        # Each item is a job and a cleanup that always runs after the job. None ends the thread.
+        # Each item is a job and a cleanup that always runs after it. None ends the thread.
         self._work: queue.Queue[tuple[Work, Work] | None] = queue.Queue(WAITING)
         self._pictures = threading.BoundedSemaphore(WAITING_PICTURES)
         self._writer = threading.Thread(target=self._write, name="output", daemon=True)
-        self.problem = ""  # reason why the files were discarded; empty: the disk works
+        self.problem = ""  # why the files were discarded; empty while the disk works
         self.left_out = 0  # lines and pictures dropped because the disk was too slow
 
     def __enter__(self) -> RunOutput:
@@ -69,19 +69,19 @@ class RunOutput:
         if self.left_out:
             log.warning("output: the disk was too slow for %d lines or pictures of %s", self.left_out, self._target)
         if self.problem:
-            kind = kind or InputError  # makes the folder discard its incomplete files
+            kind = kind or InputError  # so that the folder discards its incomplete files
         self._attempt(lambda: self._folder.__exit__(kind, error, trace))
 
     def refresh(self, line: Mapping[str, Any]) -> None:
-        """Queue a line for frames.jsonl. The caller must not change the arrays in the line afterwards."""
+        """Queue a line for frames.jsonl. The caller must not modify the line's arrays afterwards."""
         self._later(lambda: self._line(line))
 
     def light(self, frame: int, *, layers: U8) -> None:
-        """Queue the layers of a refresh for the folder `light/<frame>/`.
+        """Queue a refresh's layers for the folder `light/<frame>/`.
 
         Args:
-            frame: Number of the refresh.
-            layers: Layers as the panels show them, shape (N, h, w, 3 or 4). The caller must not change the array
+            frame: Refresh number.
+            layers: Layers as shown by the panels, shape (N, h, w, 3 or 4). The caller must not modify the array
                 afterwards.
         """
 
@@ -94,14 +94,14 @@ class RunOutput:
     def light_targets(
         self, frame: int, *, info: Mapping[str, Any], drawn: Pictures | None, true: Pictures | None
     ) -> None:
-        """Queue light.json and the target pictures of a refresh for the folder `light/<frame>/`.
+        """Queue a refresh's light.json and target pictures for the folder `light/<frame>/`.
 
-        The caller must not change the pictures afterwards.
+        The caller must not modify the pictures afterwards.
 
         Args:
-            frame: Number of the refresh.
-            info: Content of light.json.
-            drawn: Targets for the eyes that the layers were solved for.
+            frame: Refresh number.
+            info: Contents of light.json.
+            drawn: Targets for the eyes the layers were solved for.
             true: Targets for the true eyes.
         """
 
@@ -117,20 +117,20 @@ class RunOutput:
         return self._folder.staging / "light" / str(frame)
 
     def run_is_over(self) -> None:
-        """Wait for a slow disk from now on, and write at normal priority, because no refresh can be delayed."""
+        """From now on, wait for a slow disk and write at normal priority, as no refresh can be delayed now."""
         self._every_one = True
         set_niceness(0, self._writer)
-        fresh_threads()  # replace the threads of the solver and of the measurements, which have a low priority
+        fresh_threads()  # replace the solver's and the measurements' threads, which have a low priority
 
     def finish(
         self, summary: dict[str, Any], layers: U8 | None, moment: Moment | None = None, *, unseen: str = ""
     ) -> None:
-        """Queue the files that are written at the end of a run.
+        """Queue the files to be written at the end of a run.
 
         Args:
-            summary: Content of summary.json.
-            layers: Layers of the last refresh, shape (N, h, w, 3 or 4). None: write only summary.json.
-            moment: Last measured refresh, for the contact sheet, the eye views and the viewer page.
+            summary: Contents of summary.json.
+            layers: The last refresh's layers, shape (N, h, w, 3 or 4). None: write only summary.json.
+            moment: Last measured refresh, used for the contact sheet, the eye views and the viewer page.
             unseen: Viewer page to write if no refresh was measured.
         """
 
@@ -166,7 +166,7 @@ class RunOutput:
         """Queue a job and return True, or return False if the job was dropped.
 
         Args:
-            work: Job, which runs on the writing thread.
+            work: Job to run on the writing thread.
             then: Cleanup that runs after the job, even if the job failed or was skipped.
         """
         if self.problem:
@@ -179,7 +179,7 @@ class RunOutput:
         return True
 
     def _write(self) -> None:
-        """Run queued jobs in their order on the writing thread, until an item of the queue is None."""
+        """Run queued jobs in order on the writing thread, until a queue item is None."""
         set_niceness(MEASURING_NICENESS)
         while (queued := self._work.get()) is not None:
             work, then = queued
@@ -208,7 +208,7 @@ class RunOutput:
 
 
 def in_one_line(summary: dict[str, Any]) -> str:
-    """Return a line about a run for the contact sheet, with the live quality if the run measured it."""
+    """Return a line about a run for the contact sheet, with the live quality if it was measured."""
     line = f"The run: {summary['presented']} of {summary['frames']} refreshes presented, model {summary['model']}"
     if summary.get("live_db") is not None:
         line += f"; while the head moved, PSNR {summary['live_db']:.1f} dB at the true eyes (live), delays included"

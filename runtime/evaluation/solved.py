@@ -1,4 +1,4 @@
-"""Evaluate the layers of a still pair: compute retina images and quality, and write the result files."""
+"""Evaluate a still pair's layers: compute retina images and quality, and write the result files."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from runtime.records import F64, U8
 from runtime.support.artifacts import write_png, write_text
 
 BySigma = Mapping[str, float]
-GROUPS = 10  # number of groups of rows from which the standard error of sampled light is estimated
-WHOLE_PX = 1920 * 1200  # number of pixels up to which light is measured at every pixel of a picture
+GROUPS = 10  # number of row groups used to estimate the standard error of sampled light
+WHOLE_PX = 1920 * 1200  # light is measured at every pixel of a picture that has at most this many pixels
 
 
 @dataclass(frozen=True, slots=True)
 class PairQuality:
-    """Quality of layers at the eyes of a pair (docs/contracts.md, Error).
+    """Quality of layers at a pair's eyes (docs/contracts.md, Error).
 
-    Mappings are keyed by the tracking error in mm: "0", "1", "2". A value is NaN if the tracking error moves an eye so
-    far that the eye sees no part of the panels. SSIM is NaN if it was not requested.
+    Mappings are keyed by tracking error in mm: "0", "1", "2". A value is NaN if the tracking error moves an eye so far
+    that it sees no part of the panels. SSIM is NaN if it was not requested.
     """
 
-    light_db: BySigma  # with square pixels and a finite pupil; quote "1", the tracking error of a good tracker
+    light_db: BySigma  # with square pixels and a finite pupil; quote "1", a good tracker's tracking error
     expected_db: BySigma  # with one ray per pixel
     psnr_db: float  # with one ray per pixel, at exactly known eyes
     ssim: float
-    eye_psnr_db: tuple[float, ...]  # PSNR of the left and right eye, as `psnr_db`
-    standard_error_db: BySigma = field(default_factory=dict)  # of `light_db`; empty unless the pixels were sampled
+    eye_psnr_db: tuple[float, ...]  # the left and right eyes' PSNR, measured like `psnr_db`
+    standard_error_db: BySigma = field(default_factory=dict)  # that of `light_db`; empty unless the pixels were sampled
 
     def table(self) -> dict[str, Any]:
         """Return the entries for solve.json."""
@@ -49,35 +49,35 @@ class PairQuality:
 
 @dataclass(frozen=True)
 class SolvedPair:
-    """Layers of a pair of pictures, with retina images and quality that are computed on first access.
+    """Layers for a pair of pictures, with retina images and quality that are computed on first access.
 
-    The first access raises ValueError if an eye is behind a panel or sees no part of the panels.
+    On first access, ValueError is raised if an eye is behind a panel or sees no part of the panels.
     """
 
     layers: U8  # (N, h, w, 3 or 4) layers from rear to front
-    pictures: Sequence[Picture]  # targets of the left and right eye
+    pictures: Sequence[Picture]  # the left and right eyes' targets
     stack: PanelStack
     eyes_m: F64  # (2, 3) left and right eye, frame `stack`
-    fov_deg: float  # horizontal field of view of the targets
+    fov_deg: float  # the targets' horizontal field of view
 
     @cached_property
     def eye_views(self) -> EyeViews:
-        """Retina images of both eyes, and the targets to compare them with."""
+        """Both eyes' retina images, and the targets to compare them with."""
         return displayed(self.layers, self.pictures, self.stack, eyes_m=self.eyes_m, fov_deg=self.fov_deg)
 
     @cached_property
     def quality(self) -> PairQuality:
-        """Measured quality. For pictures with more than `WHOLE_PX` pixels, light is sampled sparsely."""
+        """Measured quality. If the pictures have more than `WHOLE_PX` pixels, light is sampled sparsely."""
         height_px, width_px = self.eye_views.wanted[0].shape[:2]
         every = 1 if height_px * width_px <= WHOLE_PX else 4 * math.ceil(height_px / 2160)
         return self._measured(self.eye_views, sigmas_mm=SIGMAS_MM, every=every)
 
     def sampled(self, *, sigmas_mm: Sequence[float], every: int) -> PairQuality:
-        """Measure quality without SSIM at a subset of the pixels, with the standard error of light.
+        """Measure quality without SSIM at a subset of the pixels, including the standard error of light.
 
         Args:
             sigmas_mm: Tracking errors.
-            every: Step between measured pixels and between measured rows. 1: all pixels, without a standard error.
+            every: Step between measured pixels and between measured rows. 1: all pixels, with no standard error.
         """
         views = displayed(
             self.layers, self.pictures, self.stack, eyes_m=self.eyes_m, fov_deg=self.fov_deg, similarity=False
@@ -94,19 +94,19 @@ class SolvedPair:
 
     @property
     def seen(self) -> tuple[U8, ...]:
-        """Retina image of each eye, shape (h, w, 3). Pixels whose ray misses a panel are black."""
+        """Each eye's retina image, shape (h, w, 3). Pixels whose rays miss a panel are black."""
         return tuple(retina.codes() for retina in self.eye_views.seen)
 
     def viewer(self, lines: Sequence[str]) -> str:
-        """Return a viewer page in HTML for the layers, with lines of text below the headline."""
+        """Return an HTML viewer page for the layers, with lines of text below the headline."""
         return self.eye_views.viewer(self.layers, [headline(self.quality.light_db["1"]), *lines])
 
     def write(self, folder: Path, *, lines: Sequence[str]) -> None:
         """Write the layers, eye views, contact sheet and viewer page to a folder.
 
         Args:
-            folder: Folder, which must exist.
-            lines: Lines of text below the headline of the contact sheet and of the viewer page.
+            folder: Folder to write to; must exist.
+            lines: Lines of text to show below the headline on the contact sheet and the viewer page.
         """
         for n, layer in enumerate(self.layers):
             write_png(folder / f"layer-{n}.png", layer)

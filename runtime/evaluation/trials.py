@@ -1,4 +1,4 @@
-"""Time calls in repeated runs after a warm-up. Several calls can be timed alternately."""
+"""Time calls over repeated runs, after a warm-up. Several calls can be timed in alternation."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class Timed(Generic[T]):
-    """Times of a call's runs, and the result of the last run."""
+    """The times of a call's runs, and the last run's result."""
 
     answer: T
     times_ms: tuple[float, ...]  # in the order of the runs, without the warm-up
@@ -30,14 +30,14 @@ class Timed(Generic[T]):
 def timed(
     call: Callable[[], T], *, runs: int, most: int | None = None, enough_s: float = 0.0, slow_s: float = float("inf")
 ) -> Timed[T]:
-    """Time repeated runs of a call. The first run is a warm-up that does not count unless it is slow.
+    """Time repeated runs of a call. The first run is a warm-up, which does not count unless it is slow.
 
     Args:
         call: Function to time.
         runs: Minimum number of timed runs.
         most: Maximum number of timed runs. None: `runs`.
-        enough_s: Total time of the timed runs after which no further run is started.
-        slow_s: If the first run takes at least this long, it counts and no other run follows.
+        enough_s: Once the timed runs have taken this long in total, no further run is started.
+        slow_s: If the first run takes at least this long, it counts and is the only run.
     """
     answer, took_ms = _timed(call)
     if took_ms >= slow_s * 1e3:
@@ -50,14 +50,14 @@ def timed(
 
 
 def timed_in_turn(ways: Mapping[str, Callable[[], U8]], *, runs: int) -> dict[str, Timed[U8]]:
-    """Time several calls alternately. Other load on the machine then affects all calls alike.
+    """Time several calls in alternation, so that other load on the machine affects all of them alike.
 
     Args:
-        ways: Calls by name. Their last results are copied, because a call may reuse the returned buffer.
-        runs: Number of timed runs of each call, after one run as a warm-up.
+        ways: Calls, keyed by name. Their last results are copied, because a call may reuse the buffer it returns.
+        runs: Number of timed runs of each call, after a single warm-up run.
 
     Returns:
-        Times and last result of each call, by name.
+        Each call's times and last result, keyed by name.
     """
     times: dict[str, list[float]] = {name: [] for name in ways}
     answers: dict[str, U8] = {}

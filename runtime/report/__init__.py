@@ -1,1 +1,1 @@
-"""Measurements of quality against run time, of moving viewers and of stability, with pages and plots."""
+"""Measure quality against run time, quality for moving viewers, and stability; write pages and plots."""

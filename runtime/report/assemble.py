@@ -1,4 +1,4 @@
-"""Run all measurements of the report in order, and rewrite page and record after every result."""
+"""Run the report's measurements in order, and rewrite the page and the record after every result."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ Progress = Callable[[str], None]
 
 
 class GrowingPage:
-    """Report that writes index.html, report.json and the plots again after every new result.
+    """A report that rewrites index.html, report.json and the plots after every new result.
 
-    A report that is stopped early is still usable, because its files contain all results up to that moment.
+    A report that is stopped early is still usable, because its files contain all results obtained so far.
     """
 
     def __init__(self, out: Path, command: str, progress: Progress) -> None:
@@ -37,12 +37,12 @@ class GrowingPage:
         self.record["yardsticks_ms"] = [yardstick_ms()]
 
     def doing(self, what: str) -> None:
-        """Announce a measurement that is about to start, and note it in the record as the last known step."""
+        """Announce a measurement that is about to start, and enter it in the record as the last known step."""
         self._progress(what)
         self.record["measuring"] = what
 
     def put(self, name: str, section: PageSection) -> None:
-        """Add a section under a name, or replace the section of that name, and write the files."""
+        """Add a section under a name, or replace the existing section of that name, and write the files."""
         self._sections[name] = section
         self.write()
 
@@ -80,12 +80,12 @@ def whole_report(
 
     Args:
         out: Folder for the page, the plots and report.json.
-        pairs: Folder with case files, which are measured before the built-in scenes.
-        with_focal: Also measure the focal parallax.
-        models: Model names or ONNX files to measure in addition to the shipped models.
-        quick: Draw built-in scenes with a quarter of the pixels, omit the slowest reference, and shorten the motions.
+        pairs: Folder with case files. They are measured before the built-in scenes.
+        with_focal: Also measure focal parallax.
+        models: Names or ONNX files of models to measure in addition to the shipped ones.
+        quick: Draw built-in scenes with a quarter of the pixels, omit the slowest reference, and use shorter motions.
         command: Command that reproduces the report, shown on the page.
-        progress: Function that is called with the name of each step.
+        progress: Function called with the name of each step.
 
     Raises:
         InputError: A case file or a model is invalid, or the results cannot be written.
@@ -96,7 +96,7 @@ def whole_report(
     if quick:
         stack = replace(stack, width_px=960, height_px=540)
     for name in models:
-        # Reject an invalid model now instead of after minutes of measuring.
+        # Reject an invalid model now rather than after minutes of measuring.
         for each in dict.fromkeys([*(pair.stack for pair in cases), stack]):
             load_predictor(name, each, ModelSettings(threads=1)).close()
     page = GrowingPage(out, command, progress)
@@ -123,7 +123,7 @@ def _by_size(cases: Sequence[StillPair]) -> dict[str, list[StillPair]]:
 def _frontier(
     page: GrowingPage, methods: Sequence[Method], pairs: Iterable[StillPair], *, title: str, name: str, key: str
 ) -> None:
-    """Measure pairs of one resolution, and update the section `name` and the list `key` of the record."""
+    """Measure pairs of one resolution, and update the section called `name` and the record's `key` list."""
     title = f"Light against run time: {title}"
     page.doing(f"{title}: drawing")
     before, results = page.record.get(key, []), dict[str, MethodResult]()
@@ -136,7 +136,7 @@ def _frontier(
 
 
 def _moving(page: GrowingPage, *, quick: bool) -> None:
-    """Measure all motions in parallel. The clock is simulated, so load does not affect the results."""
+    """Measure all motions in parallel. The clock is simulated, so the results are not affected by load."""
     fixed = (moving.FULL, Effort(2, 0)) if quick else moving.FIXED
     runs = [(motion, effort) for motion in moving.SCENES for effort in (None, *fixed)]
     small = partial(moving.moving_run, scale=0.15, seconds=2.5)

@@ -1,6 +1,7 @@
-"""Measure and compare regression files, which record time, light PSNR and memory of shipped models.
+"""Measure and compare regression files, which record the shipped models' time, light PSNR and memory.
 
-Run times of different machines are comparable relative to the yardstick, the time of a fixed workload.
+Run times from different machines can be compared once they are divided by the yardstick, the time taken by a fixed
+workload.
 """
 
 from __future__ import annotations
@@ -21,15 +22,15 @@ from runtime.report.page import describe
 from runtime.report.pairs import FOV_DEG, PairPainter, eyes_at
 
 SIZES = ((960, 540), (1920, 1080))
-WORSE_DB = 0.1  # minimum change that is reported; rounding and thread order cause smaller changes
-SLOWER = 0.15  # minimum relative change of a time that is reported; larger if the runs scatter
-MORE_MEMORY = 0.15  # minimum relative change of the memory that is reported
-UNSTEADY = 1.3  # maximum ratio between a measurement's yardsticks for which its times are compared
-SCATTERS = 3.0  # number of standard errors of the medians that a difference of times must exceed
+WORSE_DB = 0.1  # minimum change that is reported; smaller ones can be caused by rounding and thread order
+SLOWER = 0.15  # minimum relative change in a time that is reported; larger if the runs scatter
+MORE_MEMORY = 0.15  # minimum relative change in memory that is reported
+UNSTEADY = 1.3  # maximum ratio between a measurement's yardsticks; above it, the measurement's times are not compared
+SCATTERS = 3.0  # a difference between times must exceed this many standard errors of the medians
 
 
 class BenchEntry(BaseModel):
-    """Results of one method at one panel size, as far as a comparison needs them."""
+    """One method's results at one panel size, limited to what a comparison needs."""
 
     name: str
     width_px: int
@@ -47,16 +48,16 @@ class BenchEntry(BaseModel):
 
 
 class RegressionFile(BaseModel):
-    """Contents of a regression file, as far as a comparison needs them."""
+    """A regression file's contents, limited to what a comparison needs."""
 
     version: Literal[2]
     yardstick_ms: PositiveFloat
-    yardsticks_ms: Annotated[list[PositiveFloat], Field(min_length=1)]  # all yardsticks of the measurement
+    yardsticks_ms: Annotated[list[PositiveFloat], Field(min_length=1)]  # all yardsticks from the measurement
     methods: list[BenchEntry]
 
 
 def too_busy(yardsticks_ms: Sequence[float]) -> str:
-    """Return why times cannot be compared because of other load on the machine, or an empty string."""
+    """Return a message if other load on the machine makes times incomparable, otherwise an empty string."""
     least, most = min(yardsticks_ms), max(yardsticks_ms)
     if most > UNSTEADY * least:
         return f"the same work took {least:.1f} to {most:.1f} ms during the measurement"
@@ -69,7 +70,7 @@ def read(path: Path) -> RegressionFile:
 
 
 def yardstick_ms() -> float:
-    """Return the median time of nine runs of a fixed workload: image warp, table look-up, matrix product."""
+    """Return the median of nine times for a fixed workload: image warp, table look-up, matrix product."""
     picture = np.random.default_rng(0).integers(0, 256, (1080, 1920, 4), dtype=np.uint8)
     left = np.random.default_rng(1).random((1080, 240), dtype=np.float32)
     right = np.random.default_rng(2).random((240, 1920), dtype=np.float32)
@@ -103,9 +104,9 @@ def measured(
     """Measure the shipped models and return the contents of a regression file. This takes about a minute.
 
     Args:
-        models: Names of the models.
-        sizes: Width and height of the panels, in pixels.
-        progress: Function that is called after each measurement with a text that names the measurement.
+        models: Model names.
+        sizes: Panel widths and heights, in pixels.
+        progress: Function called after each measurement with text that names it.
     """
     yardsticks, entries = [yardstick_ms()], []
     methods = [Method(name, "network", name) for name in models]
@@ -134,7 +135,7 @@ def _entry(result: MethodResult) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Difference between two regression files that exceeds the noise."""
+    """A difference between two regression files that exceeds the noise."""
 
     what: str
     worse: bool
@@ -144,8 +145,8 @@ class Change:
 def compare(old: RegressionFile, new: RegressionFile) -> list[Change]:
     """Return the changes between two regression files that exceed the noise.
 
-    Times are divided by the yardstick of their file before the comparison. Times are not compared if the machine was
-    too busy during one of the measurements (`too_busy`).
+    Times are divided by their file's yardstick before the comparison. They are not compared if the machine was too busy
+    during either measurement (`too_busy`).
     """
     later = {entry.title: entry for entry in new.methods}
     machine = new.yardstick_ms / old.yardstick_ms

@@ -1,8 +1,8 @@
 """Measure focal parallax (supplement, 1.4), which lets an eye focus on planes beyond the panels.
 
 The eye sees the mean of the pinhole pictures through all points of its pupil. To focus at a distance f along the gaze,
-these pictures are shifted until they coincide for points at that distance: the picture through the pupil's point
-(right, up) is shifted by focal_px·right/f to the right and by focal_px·up/f upwards.
+these pictures are shifted until they coincide for points at that distance: the picture through the point (right, up) of
+the pupil is shifted by focal_px·right/f to the right and by focal_px·up/f upwards.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ PLANES_M = (-0.11, -0.08, -0.05, -0.025, 0.0, 0.022, 0.045, 0.07, 0.095)  # x of
 
 @dataclass(frozen=True, slots=True)
 class Slice:
-    """Pictures that an eye sees while it focuses on one plane."""
+    """The pictures an eye sees while it focuses on one plane."""
 
     plane_m: float  # x of the plane in focus, frame `stack`
     shown: F32  # (h, w, 3) view through the layers
@@ -45,16 +45,16 @@ class Slice:
 
 @dataclass(frozen=True, slots=True)
 class Accommodation:
-    """Distances from an eye to the point of convergence on a card and to the sharpest focus, in metres."""
+    """Distances, in metres, from an eye to where the eyes converge on a card and to the sharpest focus."""
 
     card_m: float  # distance to the point where the lines of sight meet
-    sharpest_shown_m: float  # focus at which the card is sharpest through the layers
-    sharpest_true_m: float  # focus at which the card is sharpest in the scene itself
+    sharpest_shown_m: float  # focal distance where the card is sharpest through the layers
+    sharpest_true_m: float  # focal distance where the card is sharpest in the scene itself
 
 
 @dataclass(frozen=True, slots=True)
 class FocalStack:
-    """Pictures of the right eye at several focal distances, and the accommodation for each card."""
+    """The right eye's pictures at several focal distances, and the accommodation for each card."""
 
     model: str
     slices: tuple[Slice, ...]  # one per plane of PLANES_M
@@ -62,17 +62,18 @@ class FocalStack:
 
 
 def projection(eye_m: F64, point: F64, *, focus_m: float) -> F64:
-    """Return the 3x4 projection through a point of the pupil, refocused to a distance.
+    """Return the 3x4 projection through a point of the pupil, refocused to a given distance.
 
     The third homogeneous coordinate of a projected point is its distance from the eye along the gaze, in metres.
 
     Args:
-        eye_m: Centre of the pupil, shape (3,), frame `stack`.
-        point: Offset from the centre of the pupil to the right and up, shape (2,), in metres.
-        focus_m: Distance along the gaze at which the pictures through all points coincide.
+        eye_m: The pupil's centre, shape (3,), in the `stack` frame.
+        point: Offset from the pupil's centre, to the right and up, shape (2,), in metres.
+        focus_m: Distance along the gaze where the pictures through all points coincide.
     """
     centre = image_from_stack(eye_m, width_px=WIDTH_PX, height_px=HEIGHT_PX, fov_deg=FOV_DEG)
-    # Points in front of the plane in focus move against the pupil's point, and points behind the plane move with it.
+    # As the pupil's point moves, points in front of the plane in focus move the opposite way, and points behind it the
+    # same way.
     focal_px = WIDTH_PX / 2 / math.tan(math.radians(FOV_DEG / 2))
     out_of_focus = centre[2] / focus_m - [0.0, 0.0, 0.0, 1.0]
     return centre + np.outer([focal_px * point[0], -focal_px * point[1], 0.0], out_of_focus)
@@ -91,13 +92,13 @@ def card_windows(eye_m: F64) -> list[tuple[slice, slice]]:
 
 
 def contrast(image: F32, window: tuple[slice, slice]) -> float:
-    """Return the RMS gradient of the brightness in a window. Sharper pictures have a larger gradient."""
+    """Return the RMS brightness gradient in a window. Sharper pictures have a larger gradient."""
     grey = image[window].mean(axis=2)
     return float(np.sqrt((np.diff(grey, axis=1) ** 2).mean() + (np.diff(grey, axis=0) ** 2).mean()))
 
 
 def sharpest(distances_m: Sequence[float], values: Sequence[float]) -> float:
-    """Return the distance of the largest value, refined by a parabola through its two neighbours."""
+    """Return the distance that gives the largest value, refined by a parabola through its two neighbours."""
     best = int(np.argmax(values))
     if not 0 < best < len(values) - 1:
         return distances_m[best]
@@ -111,10 +112,10 @@ def focal_stack(
     """Solve for two pinhole eyes, then focus the right eye at every plane of PLANES_M.
 
     Args:
-        painter: Painter of the cards (`cards_painter`).
-        stack: Geometry of the panels.
-        model: Name of the model or path of an ONNX file.
-        progress: Function that is called after each plane with the number of finished planes and of all planes.
+        painter: Painter that draws the cards (`cards_painter`).
+        stack: Panel geometry.
+        model: Model name, or path of an ONNX file.
+        progress: Function called after each plane with the number of planes finished and the total number.
     """
     eyes = eyes_at(distance_m=DISTANCE_M)
     predictor = load_predictor(model, stack, ModelSettings())
@@ -146,14 +147,17 @@ def focal_stack(
 
 
 def seen_through(matrix: F64, layers: U8, stack: PanelStack) -> Retina:
-    """Compute the picture of the layers through a projection. Its mask marks rays that cross all panels."""
+    """Compute the picture of the layers as seen through a projection.
+
+    The mask marks rays that cross all panels.
+    """
     rays = Rays(matrix, np.arange(WIDTH_PX) + np.float64(0.5), (np.arange(HEIGHT_PX) + np.float64(0.5))[:, None])
     panels = [stack.panel(index) for index in range(stack.count)]
     return through_layers(layers, lambda rows: (rays.on(panel, rows) for panel in panels), rays.toward_panels(), stack)
 
 
 def cards_painter(stack: PanelStack) -> PairPainter:
-    """Return a painter of three finely textured cards: behind, in and in front of the middle panel."""
+    """Return a painter for three finely textured cards: behind, in and in front of the middle panel."""
     card = shapes.card(0.034, 0.036, repeat=(3.4, 3.6))
     things = tuple(
         Thing(card, "checker", (x, y, 0.0), colour, lit=False)

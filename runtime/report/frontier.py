@@ -1,4 +1,4 @@
-"""Measure the light PSNR and run time of every method on every pair, each in a separate process."""
+"""Measure every method's light PSNR and run time on every pair, each in a separate process."""
 
 from __future__ import annotations
 
@@ -34,30 +34,30 @@ P = ParamSpec("P")
 T = TypeVar("T")
 Kind = Literal["network", "iterative"]
 SHIPPED = ("balanced", "fast", "best")  # the default model comes first in a report
-SART = (1, 3, 10, 30)  # iterations of the reference methods
-ENOUGH_S = 2.0  # total time after which no further run of a method on a pair is timed
+SART = (1, 3, 10, 30)  # iteration counts of the reference methods
+ENOUGH_S = 2.0  # total time after which no further runs of a method on a pair are timed
 MOST_RUNS = 25  # maximum number of timed runs of one method on one pair
 FEWEST_RUNS = 3  # minimum number of timed runs of one method on one pair, unless the method is slow
 SLOW_S = 4.0  # a method whose first run takes at least this long runs only once
 OFF_STEP = 3  # for displaced eyes, every third ray of every third row is traced
-QUOTED = "1"  # key of `light_db` for the figure to quote, at a tracking error of 1 mm
+QUOTED = "1"  # the `light_db` key of the figure to quote, at a tracking error of 1 mm
 
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """Way to compute layers that the report compares: a network, or SART as an iterative reference."""
+    """A method of computing layers, compared in the report: a network, or SART as an iterative reference."""
 
     name: str
     kind: Kind
-    source: str  # name of the model or path of its ONNX file, as for `load_predictor`
-    iterations: int = 0  # iterations of SART; 0 for a network
+    source: str  # model name, or path of an ONNX file, as for `load_predictor`
+    iterations: int = 0  # number of SART iterations; 0 for a network
 
     def opened(self, stack: PanelStack, *, threads: int) -> Predictor:
         """Load the method's predictor for a stack.
 
         Raises:
             InputError: The model is unknown, invalid or unsuitable for the stack.
-            MissingPart: A package or the compiled library that the model needs is not installed.
+            MissingPart: A package or the compiled library needed by the model is not installed.
         """
         from runtime.config import ModelSettings
         from runtime.model.predictor import load_predictor
@@ -69,11 +69,11 @@ class Method:
 
 
 def shipped_and_references(models: Sequence[str] = (), *, quick: bool = False) -> list[Method]:
-    """Return the methods of a report: shipped models, further models and SART with increasing iterations.
+    """Return a report's methods: shipped models, added models, and SART with increasing iterations.
 
     Args:
-        models: Names or ONNX files of the further models.
-        quick: Omit the slowest reference, which is SART with the most iterations.
+        models: Names or ONNX files of the added models.
+        quick: Omit the slowest reference (SART with the most iterations).
     """
     methods = [Method(name, "network", name) for name in SHIPPED]
     methods += [Method(Path(name).stem, "network", name) for name in models]
@@ -82,30 +82,30 @@ def shipped_and_references(models: Sequence[str] = (), *, quick: bool = False) -
 
 @dataclass(frozen=True, slots=True)
 class MethodRun:
-    """Layers that one method computed for one pair in a separate process, with run times and peak memory."""
+    """Layers computed by one method for one pair in a separate process, with run times and peak memory."""
 
     layers: U8  # (N, h, w, 3), rear to front
-    run_ms: tuple[float, ...]  # times of complete solutions, from two decoded images to N 8-bit layers
-    memory_mib: float  # peak memory of the process
+    run_ms: tuple[float, ...]  # times taken by complete solutions, from two decoded images to N 8-bit layers
+    memory_mib: float  # the process's peak memory
     parameters: int
     precision: str
 
 
 @dataclass(frozen=True, slots=True)
 class PairResult:
-    """Quality, run times and memory of one method on one pair."""
+    """One method's quality, run times and memory on one pair."""
 
-    pair: str  # name of the pair
+    pair: str  # pair name
     run_ms: tuple[float, ...]
     memory_mib: float
     quality: PairQuality
-    psnr_db_off_eye: dict[str, float]  # mean PSNR at displaced eyes, by displacement, such as "2mm"
-    viewer: str = ""  # name of the viewer page that shows the layers; empty: not written
+    psnr_db_off_eye: dict[str, float]  # mean PSNR at displaced eyes, keyed by displacement, such as "2mm"
+    viewer: str = ""  # file name of the viewer page that shows the layers; empty if no page was written
 
 
 @dataclass(frozen=True, slots=True)
 class MethodResult:
-    """Means of a method over all pairs of one resolution, an entry of `methods` in report.json."""
+    """A method's means over all pairs of one resolution: an entry in `methods` in report.json."""
 
     name: str
     kind: Kind
@@ -116,19 +116,19 @@ class MethodResult:
     ms_p99: float
     memory_mib: float
     parameters: int
-    light_db: dict[str, float]  # by tracking error in mm: "0", "1", "2"
-    expected_db: dict[str, float]  # by tracking error in mm, with one ray per pixel
+    light_db: dict[str, float]  # keyed by tracking error in mm: "0", "1", "2"
+    expected_db: dict[str, float]  # keyed by tracking error in mm, with one ray per pixel
     psnr_db: float
     ssim: float
-    worst_eye_psnr_db: float  # worst of all eyes and pairs
-    psnr_db_off_eye: dict[str, float]  # by displacement of the eye, such as "2mm"
+    worst_eye_psnr_db: float  # the worst over all eyes and pairs
+    psnr_db_off_eye: dict[str, float]  # keyed by the eye's displacement, such as "2mm"
     pairs: list[PairResult] = field(default_factory=list)
 
     @property
     def spread_ms(self) -> tuple[float, float]:
         """10th and 90th percentiles of the run times in ms.
 
-        The percentiles are taken over the ratios of each time to the median of its pair, and scaled by `ms_p50`.
+        Each time is divided by its pair's median. The percentiles of these ratios are scaled by `ms_p50`.
         """
         ratios = np.concatenate([np.asarray(pair.run_ms) / np.median(pair.run_ms) for pair in self.pairs])
         low, high = np.percentile(ratios, (10, 90))
@@ -146,13 +146,13 @@ def measure(
     """Measure every method on every pair, pair by pair.
 
     Args:
-        methods: Methods to measure. Viewer pages are written for the first method only.
+        methods: Methods to measure. Viewer pages are written only for the first method.
         pairs: Pairs of one resolution.
-        threads: Number of threads of a method.
+        threads: Number of threads for each method.
         viewers: Folder for the viewer pages, or None to write no pages.
 
     Yields:
-        After each measurement, the names of method and pair, and the method's result over the pairs so far.
+        After each measurement, the names of the method and the pair, and the method's result over the pairs so far.
 
     Raises:
         FatalError: A measurement failed or a measuring process died.
@@ -167,11 +167,11 @@ def measure(
 
 
 def apart(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-    """Call an importable function in a new process and return its result.
+    """Call an importable function in a new process, and return its result.
 
     Raises FatalError if the process dies or the function raises one of the project's errors.
     """
-    # Redirect the new process's stdout to stderr, because the stdout of this process may be JSON.
+    # Redirect the new process's stdout to stderr, because this process's stdout may be JSON.
     with ProcessPoolExecutor(1, get_context("spawn"), initializer=os.dup2, initargs=(2, 1)) as pool:
         try:
             return pool.submit(_called, function, args, kwargs).result()
@@ -187,9 +187,9 @@ def _called(function: Callable[..., T], args: Any, kwargs: Any) -> T:
 
 
 def run_method(method: Method, pair: StillPair, threads: int) -> MethodRun:
-    """Load, warm up and time a method on a pair, and measure the peak memory of this process.
+    """Load, warm up and time a method on a pair, and measure this process's peak memory.
 
-    The function runs in a process that is started for this measurement alone.
+    This function is run in a process started only for this measurement.
     """
     import cv2
 
@@ -197,7 +197,8 @@ def run_method(method: Method, pair: StillPair, threads: int) -> MethodRun:
 
     cv2.setNumThreads(threads)
     predictor = method.opened(pair.stack, threads=threads)
-    # Reset the peak. Older kernels refuse; the peak then includes the interpreter's start, which needs less memory.
+    # Reset the peak. Older kernels refuse; the peak then also covers the interpreter's start-up, which needs less
+    # memory.
     with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
     done = timed(
@@ -217,10 +218,10 @@ def _peak_mib() -> float:
 
 
 def pair_result(pair: StillPair, run: MethodRun, *, viewer: Path | None = None) -> PairResult:
-    """Measure the quality of layers at the pair's eyes and at displaced eyes (docs/contracts.md, Error).
+    """Measure the layers' quality at the pair's eyes and at displaced eyes (docs/contracts.md, Error).
 
     Args:
-        pair: Pictures, eyes and targets for displaced eyes.
+        pair: Pictures, eye positions, and targets for displaced eyes.
         run: Layers to evaluate, and their run times.
         viewer: Folder for a viewer page that shows the layers, or None to write no page.
     """
@@ -265,7 +266,7 @@ def _together(method: Method, pair: StillPair, run: MethodRun, pairs: list[PairR
 
 
 def _means(tables: Sequence[Any]) -> dict[str, float]:
-    """Return the mean of the finite values of each key. Keys without a finite value are omitted."""
+    """Return the mean of the finite values for each key. Keys without any finite value are omitted."""
     keys = dict.fromkeys(key for table in tables for key in table)
     values_of = {key: [table[key] for table in tables if math.isfinite(table.get(key, math.nan))] for key in keys}
     return {key: float(np.mean(values)) for key, values in values_of.items() if values}

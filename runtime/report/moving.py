@@ -1,7 +1,7 @@
 """Measure live quality for moving viewers in simulated runs, with fixed and with automatic efforts.
 
-An effort is a raster and a number of steps, which determine the time of a solution. Unless the effort is fixed, the
-runtime chooses the effort of each solution.
+An effort is a raster and a number of steps, which together determine how long a solution takes. Unless the effort is
+fixed, the runtime chooses one for each solution.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from runtime.frame.kept_light import Output
 from runtime.records import Effort
 
 SCENES = {"still": "demo", "lean": "demo", "walk": "demo", "stop-and-go": "demo", "film": "moving"}  # by motion
-FULL = Effort(1, 4)  # full raster and all steps of the model `balanced`
+FULL = Effort(1, 4)  # full raster and all steps of the `balanced` model
 FIXED = (FULL, Effort(1, 1), Effort(1, 0), Effort(2, 0), Effort(3, 0), Effort(4, 0))
-# Simulated times of a solution's stages for the full raster, as on a slow processor.
+# Simulated times for a solution's stages on the full raster, as on a slow processor.
 COSTS_MS = {"render": 44, "prepare": 40, "inference": 31, "finish": 38, "step": 85}
 SECONDS, NOISE_MM, SEED = 6.0, 0.3, 5
-EVERY = 23  # refreshes between two measured refreshes; not a multiple of the refreshes per solution
+EVERY = 23  # number of refreshes from one measured refresh to the next; not a multiple of the refreshes per solution
 
 
 @dataclass(frozen=True, slots=True)
 class Moving:
-    """Result of one simulated run, for one motion with one effort."""
+    """The result of one simulated run, for one motion with one effort."""
 
     motion: str
     effort: str  # name of a fixed effort, or `auto`
     live_db: float  # live quality (docs/contracts.md, Error)
-    view_error_mm: tuple[float, float]  # p50 and p95 of the distance from the true eyes to the eyes solved for
-    efforts: Mapping[str, float]  # seconds for which solutions of each effort were shown
-    refreshes: int  # number of measured refreshes
+    view_error_mm: tuple[float, float]  # p50 and p95 of the distance between the true eyes and the eyes solved for
+    efforts: Mapping[str, float]  # seconds for which each effort's solutions were shown
+    refreshes: int  # number of refreshes measured
 
 
 def simulated_run(
@@ -49,14 +49,14 @@ def simulated_run(
     keep_light: int = 0,
     output: Output | None = None,
 ) -> dict[str, Any]:
-    """Run on a simulated clock, measure live quality, and return the contents of summary.json.
+    """Run against a simulated clock, measure live quality, and return the contents of summary.json.
 
     Args:
-        settings: Settings of the run, with a recording as the sensor.
-        scale: Factor for the number of rows and columns of the panels.
-        fixed: Effort of every solution if the setting `model.effort` is `full`. None: all steps of the model.
-        keep_light: Keep the layers of every `keep_light`-th refresh. 0: keep no layers.
-        output: Destination of the kept layers and of the refreshes' records.
+        settings: Run settings, with a recording as the sensor.
+        scale: Factor for the panels' number of rows and columns.
+        fixed: Effort for every solution if the setting `model.effort` is `full`. None: all of the model's steps.
+        keep_light: Keep the layers from every `keep_light`-th refresh. 0: keep no layers.
+        output: Destination for the kept layers and the refreshes' records.
 
     Raises:
         FatalError: The settings or their files cannot be used.
@@ -74,9 +74,9 @@ def settings_for(recording: Path, *, scene: str, effort: str) -> Settings:
     """Return the default settings for a simulated run, with the stage times of COSTS_MS.
 
     Args:
-        recording: Recording with the motion of the viewer.
-        scene: Name of the content.
-        effort: Value of the setting `model.effort`: `full` or `auto`.
+        recording: Recording of the viewer's motion.
+        scene: Name of the scene to show.
+        effort: Value for the setting `model.effort`: `full` or `auto`.
     """
     table = Settings().model_dump()
     table["sensor"] |= {"driver": "replay", "source": str(recording), "loop": False}
@@ -90,17 +90,17 @@ def settings_for(recording: Path, *, scene: str, effort: str) -> Settings:
 def moving_run(
     motion: str, effort: Effort | None, *, seconds: float = SECONDS, scale: float = 0.5, seed: int = SEED
 ) -> Moving:
-    """Simulate one motion of the viewer, and measure what the viewer sees.
+    """Simulate one motion by the viewer, and measure what the viewer sees.
 
     Args:
-        motion: Key of SCENES. In `film`, the content moves and the head rests.
-        effort: Effort of every solution, or None to let the runtime choose.
-        seconds: Length of the motion.
-        scale: Factor for the number of rows and columns of the panels.
-        seed: Seed of the path and the sensor's noise.
+        motion: Key in SCENES. In `film`, the content moves and the head is at rest.
+        effort: Effort for every solution, or None to let the runtime choose.
+        seconds: Duration of the motion.
+        scale: Factor for the panels' number of rows and columns.
+        seed: Seed for the path and the sensor noise.
 
     Raises:
-        FatalError: The run gives no measurement.
+        FatalError: The run yields no measurement.
     """
     with tempfile.TemporaryDirectory(prefix="phasestack-") as folder:
         recording = Path(folder) / "motion.mcap"

@@ -1,4 +1,4 @@
-"""Self-contained HTML pages of reports, the style of plots, and a description of the machine."""
+"""Self-contained HTML pages for reports, a plot style, and a description of the machine."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PACKAGES = (
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """PNG picture with a caption, for a page."""
+    """A PNG picture with a caption, for use on a page."""
 
     name: str  # file name without .png
     png: bytes
@@ -32,13 +32,13 @@ class Figure:
 
     @property
     def source(self) -> str:
-        """Data URI of the picture, which keeps the page independent of other files."""
+        """The picture's data URI, which keeps the page independent of other files."""
         return "data:image/png;base64," + base64.b64encode(self.png).decode()
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Table of text with a heading for each column."""
+    """A table of text, with a heading for each column."""
 
     headings: Sequence[str]
     rows: Sequence[Sequence[str]]
@@ -47,24 +47,24 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class PageSection:
-    """Section of a page, shown as paragraphs, figures, tables and links under a title."""
+    """A page section, shown as paragraphs, figures, tables and links under a title."""
 
     title: str
     text: Sequence[str] = ()  # paragraphs of plain text
     figures: Sequence[Figure] = ()
     tables: Sequence[Table] = ()
-    links: Sequence[tuple[str, str]] = ()  # pairs of link text and file name, relative to the page's folder
+    links: Sequence[tuple[str, str]] = ()  # pairs of link text and file name; names are relative to the page's folder
 
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """Complete report page, which can be written to a folder with its pictures and data."""
+    """A complete report page that can be written to a folder with its pictures and data."""
 
     title: str
-    lead: str  # one sentence below the title with the main result
+    lead: str  # sentence below the title that gives the main result
     sections: Sequence[PageSection]
-    machine: Mapping[str, str] = field(default_factory=dict)  # facts about the machine by name (`describe`)
-    command: str = ""  # command that reproduces the page; empty: not shown
+    machine: Mapping[str, str] = field(default_factory=dict)  # facts about the machine, keyed by name (`describe`)
+    command: str = ""  # command that reproduces the page; not shown if empty
     notes: Sequence[str] = ()  # caveats
 
     def html(self) -> str:
@@ -76,18 +76,18 @@ class Page:
         return environment.from_string(template).render(page=self)
 
     def figures(self) -> list[Figure]:
-        """Return all figures of the page in the order in which they appear."""
+        """Return all figures on the page, in order of appearance."""
         return [figure for section in self.sections for figure in section.figures]
 
     def write(self, out: Path, *, record: str, data: Any) -> None:
-        """Write index.html, the pictures and the data into a folder.
+        """Write index.html, the pictures and the data to a folder.
 
-        Either all files appear in the folder or none.
+        Either all files appear in the folder or none does.
 
         Args:
-            out: Folder, created if necessary.
-            record: Name of the JSON file for the data.
-            data: Content of the JSON file.
+            out: Folder to write to; created if necessary.
+            record: Name of the JSON file that stores the data.
+            data: Contents of the JSON file.
 
         Raises:
             InputError: The files cannot be written.
@@ -115,21 +115,21 @@ def drawing(width_in: float, height_in: float) -> Iterator[Any]:
 
 
 def png(figure: Any) -> bytes:
-    """Return a matplotlib figure as PNG without time stamps, which makes the bytes reproducible."""
+    """Return a matplotlib figure as a PNG file without time stamps, so that its bytes are reproducible."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", metadata={"Software": None})
     return buffer.getvalue()
 
 
 def describe() -> dict[str, str]:
-    """Return facts about the machine and versions of installed packages, by name, for a report page."""
+    """Return facts about the machine and package versions, keyed by name, for a report page."""
     facts = {
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "processor": _processor(),
         "cores": str(len(os.sched_getaffinity(0))),
         "memory": f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.1f} GiB",
         "system": f"{platform.system()} {platform.release()}",
-        "seed": "0",  # seed of all random numbers of a report
+        "seed": "0",  # seed for all random numbers in a report
         "Python": platform.python_version(),
     }
     for name in PACKAGES:

@@ -25,13 +25,13 @@ if TYPE_CHECKING:
 
 Metres = Annotated[float, Field(strict=True, ge=-EYE_MOST_M, le=EYE_MOST_M)]
 Place = tuple[Metres, Metres, Metres]  # frame `stack`
-OFF_MM = (2, 4, 6)  # displacements of the eyes for which targets are drawn
-FOV_DEG = 40.0  # horizontal field of view of the drawn pictures
+OFF_MM = (2, 4, 6)  # eye displacements to draw targets for
+FOV_DEG = 40.0  # the drawn pictures' horizontal field of view
 
 
 @dataclass(frozen=True, slots=True)
 class OffView:
-    """Target picture for an eye that is displaced from its nominal position."""
+    """A target picture for an eye displaced from its nominal position."""
 
     mm: float  # displacement
     eye_m: F64  # (3,) displaced position, frame `stack`
@@ -40,18 +40,18 @@ class OffView:
 
 @dataclass(frozen=True, slots=True)
 class StillPair:
-    """Target pictures for two eyes, the positions of the eyes, and the panels to show the pictures on."""
+    """Target pictures for two eyes, the eyes' positions, and the panels to show the pictures on."""
 
     name: str
     stack: PanelStack
     eyes_m: F64  # (2, 3) left and right eye, frame `stack`
-    images: tuple[U8, U8]  # (h, w, 3) pictures of the left and right eye
+    images: tuple[U8, U8]  # (h, w, 3) pictures for the left and right eyes
     fov_deg: float  # horizontal field of view
     off: tuple[OffView, ...] = ()  # further targets, for displaced eyes
 
 
 class OffEntry(BaseModel):
-    """Entry of a case file that describes the target picture for a displaced eye."""
+    """An entry in a case file that describes the target picture for a displaced eye."""
 
     mm: Annotated[float, Field(strict=True, ge=0, le=1000 * EYE_MOST_M)]
     eye: Place
@@ -59,7 +59,7 @@ class OffEntry(BaseModel):
 
 
 class CaseFile(BaseModel):
-    """Validated contents of a case file (docs/contracts.md)."""
+    """A case file's validated contents (docs/contracts.md)."""
 
     panels: dict[str, Any]  # fields of StackGeometry
     eyes: tuple[Place, Place]  # left and right eye
@@ -69,7 +69,7 @@ class CaseFile(BaseModel):
 
 
 def read_pairs(folder: Path) -> list[StillPair]:
-    """Read all case files of a folder in the order of their names. Other JSON files are ignored.
+    """Read all case files in a folder, in order of name. Other JSON files are ignored.
 
     Raises InputError if a case file is invalid or the folder contains no case file.
     """
@@ -105,12 +105,12 @@ def _case(path: Path, table: dict[str, Any]) -> StillPair:
 
 
 def eyes_at(*, distance_m: float, angle_deg: float = 0.0, height_m: float = 0.0, ipd_m: float = 0.063) -> F64:
-    """Return the left and right eye of a viewer who faces the origin, shape (2, 3), frame `stack`.
+    """Return the left and right eyes of a viewer facing the origin, in the `stack` frame, shape (2, 3).
 
     Args:
-        distance_m: Distance of the midpoint between the eyes from the origin.
-        angle_deg: Angle of the midpoint from the x axis towards +y.
-        height_m: Height of the midpoint above the origin.
+        distance_m: Distance from the origin to the midpoint between the eyes.
+        angle_deg: The midpoint's angle from the x axis towards +y.
+        height_m: The midpoint's height above the origin.
         ipd_m: Distance between the eyes.
     """
     angle = math.radians(angle_deg)
@@ -121,11 +121,11 @@ def eyes_at(*, distance_m: float, angle_deg: float = 0.0, height_m: float = 0.0,
 
 
 def beside(eye_m: ArrayLike, mm: float) -> list[F64]:
-    """Return the positions to the right of, above, to the left of and below an eye, in frame `stack`.
+    """Return positions to the right of, above, to the left of and below an eye, in the `stack` frame.
 
     Args:
-        eye_m: Position of the eye, shape (3,), frame `stack`. The directions are the axes of the eye's pose.
-        mm: Distance of each returned position from the eye.
+        eye_m: The eye's position, shape (3,), in the `stack` frame. The directions are the axes of the eye's pose.
+        mm: Distance from the eye to each returned position, in mm.
     """
     pose = stack_from_eye(eye_m)
     directions = ((1, 0), (0, 1), (-1, 0), (0, -1))
@@ -133,13 +133,13 @@ def beside(eye_m: ArrayLike, mm: float) -> list[F64]:
 
 
 class PairPainter:
-    """Painter that draws a scene from any position.
+    """Painter that draws a scene as seen from any position.
 
-    The painter owns an OpenGL context. Use it as a context manager and on one thread only.
+    The painter owns an OpenGL context. Use it as a context manager, and on one thread only.
     """
 
     def __init__(self, scene: str | Scene, stack: PanelStack) -> None:
-        """Open a scene, given by an object or the name of a built-in scene.
+        """Open a scene, given as an object or by the name of a built-in scene.
 
         Raises MissingPart if OpenGL or its Python package is not installed.
         """
@@ -160,10 +160,10 @@ class PairPainter:
         """Draw the scene through any projection, and return the picture, shape (h, w, 4).
 
         Args:
-            eye_m: Position of the eye, shape (3,), frame `stack`.
-            pixels_from_stack: 3x4 projection of points in frame `stack` to the picture's pixels.
-            width_px: Width of the picture.
-            height_px: Height of the picture.
+            eye_m: The eye's position, shape (3,), in the `stack` frame.
+            pixels_from_stack: 3x4 projection from points in the `stack` frame to the picture's pixels.
+            width_px: Picture width.
+            height_px: Picture height.
         """
         from runtime.content.base import View
 
@@ -178,13 +178,13 @@ class PairPainter:
     def pair(
         self, name: str, eyes_m: F64, stack: PanelStack, *, fov_deg: float = FOV_DEG, off_mm: Sequence[float] = OFF_MM
     ) -> StillPair:
-        """Draw a pair at the resolution of a stack, with targets for displaced eyes.
+        """Draw a pair at a stack's resolution, with targets for displaced eyes.
 
         Args:
-            name: Name of the pair.
-            eyes_m: Left and right eye, shape (2, 3), frame `stack`.
-            stack: Geometry and resolution of the panels.
-            fov_deg: Horizontal field of view of the pictures.
+            name: Pair name.
+            eyes_m: Left and right eyes, shape (2, 3), in the `stack` frame.
+            stack: Panel geometry and resolution.
+            fov_deg: The pictures' horizontal field of view.
             off_mm: Displacements. For each displacement, both eyes are moved right, up, left and down.
         """
         size = {"width_px": stack.width_px, "height_px": stack.height_px}
@@ -206,7 +206,7 @@ PROCEDURAL = (
 
 
 def procedural_pairs(stack: PanelStack) -> Iterator[StillPair]:
-    """Draw the built-in pairs of the report, which show two scenes from three positions in total."""
+    """Draw the report's built-in pairs, which show two scenes from a total of three positions."""
     for scene, name, place in PROCEDURAL:
         with PairPainter(scene, stack) as painter:
             pair = painter.pair(name, eyes_at(**place), stack)

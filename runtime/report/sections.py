@@ -1,4 +1,4 @@
-"""Sections of the report page: light against run time, live quality in motion, and focal parallax."""
+"""Sections on the report page: light against run time, live quality in motion, and focal parallax."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ def frontier_section(results: Sequence[MethodResult], *, title: str, name: str) 
     """Return a section with a plot and a table of the methods measured so far at one resolution.
 
     Args:
-        results: Result of each method.
-        title: Heading of the section.
-        name: Suffix of the plot's file name.
+        results: Each method's result.
+        title: Section heading.
+        name: Suffix for the plot's file name.
     """
     pairs = "; ".join(pair.pair for pair in results[0].pairs)
     text = [
@@ -38,9 +38,9 @@ def frontier_section(results: Sequence[MethodResult], *, title: str, name: str) 
 def frontier_plot(results: Sequence[MethodResult], *, name: str) -> Figure:
     """Plot light against median run time for all methods, in a figure called `name`.
 
-    Shipped models form one curve and the iterative references another. Added models are single points. A curve skips
-    methods that are slower than another method of the curve without being better. Bars span the 10th to 90th
-    percentiles of the run times, and small dots are single pairs.
+    Shipped models form one curve and the iterative references another; added models are shown as single points. Each
+    curve leaves out any method that is slower than another method on that curve and no better. Bars span the 10th to
+    90th percentiles of the run times, and each small dot is a single pair.
     """
     beside: Any = {"textcoords": "offset points", "fontsize": 8.5}
     with drawing(9.6, 5.0) as figure:
@@ -59,7 +59,7 @@ def frontier_plot(results: Sequence[MethodResult], *, name: str) -> Figure:
             if len(of_pairs) > len(dots):
                 seen = [(ms, light_db.get(QUOTED, np.nan)) for ms, light_db in of_pairs]
                 axes.scatter(*zip(*seen, strict=True), s=9, color=colour, alpha=0.5, linewidths=0)
-            for result in dots:  # names are above and to the left of the points, a region that a rising curve avoids
+            for result in dots:  # names go above and to the left of the points, where a rising curve never passes
                 axes.annotate(result.name, (result.ms_p50, result.quoted_db), xytext=(-5, 6), ha="right", **beside)
         axes.set(xscale="log", xlabel="median time of a whole solution, ms", ylabel="light, dB (tracking error 1 mm)")
         axes.use_sticky_edges = False  # bars have sticky edges, which would suppress the margins
@@ -74,7 +74,7 @@ def frontier_plot(results: Sequence[MethodResult], *, name: str) -> Figure:
 
 
 def rising(places: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Return the points (time, dB) with a higher quality than all faster points, fastest first."""
+    """Return the (time, dB) points whose quality is higher than that of all faster points, fastest first."""
     found: list[tuple[float, float]] = []
     for place in sorted(places):
         if not found or place[1] > found[-1][1]:
@@ -83,7 +83,7 @@ def rising(places: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
 
 
 def kind_of(result: MethodResult) -> str:
-    """Return the key in KINDS that determines the curve and style of a result."""
+    """Return the key in KINDS that determines a result's curve and style."""
     return "shipped" if result.name in SHIPPED else "added" if result.kind == "network" else result.kind
 
 
@@ -107,7 +107,7 @@ def method_table(results: Sequence[MethodResult]) -> Table:
 
 
 def moving_section(found: Sequence[Moving]) -> PageSection:
-    """Return a section with live quality and view error for each motion and effort measured so far."""
+    """Return a section with the live quality and view error for each motion and effort measured so far."""
     costs = ", ".join(f"{stage} {ms}" for stage, ms in COSTS_MS.items())
     text = [
         "A solution takes longer than a refresh, and the head keeps moving. At every refresh the outer panels are "
@@ -129,14 +129,14 @@ def moving_section(found: Sequence[Moving]) -> PageSection:
 
 
 def most_used(one: Moving) -> str:
-    """Return the efforts shown for at least a tenth of the time with their percentages, longest first."""
+    """Return the efforts in use for at least a tenth of the time, with percentages, longest first."""
     seconds = sorted(one.efforts.items(), key=lambda item: -item[1])
     total_s = sum(one.efforts.values())
     return ", ".join(f"{name} {100 * s / total_s:.0f}%" for name, s in seconds if s >= total_s / 10)
 
 
 def moving_plot(found: Sequence[Moving]) -> Figure:
-    """Plot live quality and view error of each motion, with lines for fixed efforts and stars for `auto`."""
+    """Plot each motion's live quality and view error, with lines for fixed efforts and stars for `auto`."""
     motions = list(dict.fromkeys(one.motion for one in found))
     efforts = [*(effort.name for effort in FIXED), "auto"]
     with drawing(9.6, 6.4) as figure:
@@ -164,7 +164,7 @@ def moving_plot(found: Sequence[Moving]) -> Figure:
 
 
 def focal_section(stack: FocalStack) -> PageSection:
-    """Return a section with a table of distances of convergence and focus, and with focused pictures."""
+    """Return a section with a table of convergence and focal distances, and with focused pictures."""
     headings = ["card", "lines of sight meet at, mm", "sharpest through the layers, mm", "sharpest in truth, mm"]
     rows = []
     for name, card in zip(NAMES, stack.cards, strict=True):

@@ -1,1 +1,1 @@
-"""Stiff and extreme cases of all numerical methods, compared with independent references."""
+"""Stiff and extreme cases for all numerical methods, compared with independent references."""

@@ -1,4 +1,4 @@
-"""Calibration cases (supplement, (15)-(28)) in which point pairs barely determine a known similarity."""
+"""Calibration cases (supplement, (15)-(28)) where point pairs barely determine a known similarity."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from runtime.records import F64
 from runtime.report.stability.trial import EPS64, Answer, Trial
 
 STAGE = "calibration"
-Fit = Callable[[F64, F64], F64]  # from (K, 3) points in `sensor` and in `stack`, metres, to the 4x4 stack_from_sensor
+Fit = Callable[[F64, F64], F64]  # maps (K, 3) points in `sensor` and in `stack`, metres, to the 4x4 stack_from_sensor
 TURN = Rotation.from_quat([-1, 3, 5, 2]).as_matrix()
 HALF_TURN = Rotation.from_quat([1, 2, 2, 0]).as_matrix()
 
@@ -22,8 +22,8 @@ def cloud(*, aspect: float = 1.0, size_m: float = 0.3, count: int = 27) -> F64:
     """Return random points in a box around the origin, shape (count, 3).
 
     Args:
-        aspect: Ratio of the box's extents along y and z to its extent along x.
-        size_m: Half the extent of the box along x.
+        aspect: The box's extents along y and z, relative to its extent along x.
+        size_m: Half the box's extent along x.
         count: Number of points.
     """
     return np.random.default_rng(11).uniform(-1, 1, (count, 3)) * [size_m, size_m * aspect, size_m * aspect]
@@ -39,16 +39,15 @@ def fitted(
 ) -> Answer:
     """Transform points by a known similarity, and compare the fitted similarity with the known one.
 
-    The condition number is the largest coordinate of the points over their RMS extent along the second principal axis,
-    in the worse of the two frames. Relative errors of the coordinates, including rounding, rotate the fit by this
-    factor.
+    The condition number is the points' largest coordinate divided by their RMS extent along the second principal axis,
+    in whichever frame is worse. Relative errors in the coordinates, including rounding, rotate the fit by this factor.
 
     Args:
         fit: Solver to test.
-        sensor_m: Points before the transformation, shape (K, 3).
-        scale: Scale of the known similarity.
-        offset_m: Translation of the known similarity.
-        turn: 3x3 rotation of the known similarity.
+        sensor_m: Points before transformation, shape (K, 3).
+        scale: The known similarity's scale.
+        offset_m: The known similarity's translation.
+        turn: The known similarity's 3x3 rotation.
     """
     stack_m = scale * sensor_m @ turn.T + offset_m
     matrix = fit(sensor_m, stack_m)
@@ -66,10 +65,10 @@ def fitted(
 
 
 def trials(fits: Mapping[str, Fit]) -> Iterator[Trial]:
-    """Yield all trials of the calibration.
+    """Yield all trials for calibration.
 
     Args:
-        fits: Solvers by method name. Only `least-squares` is tested on the extreme cases.
+        fits: Solvers, keyed by method name. Only `least-squares` is tested on the extreme cases.
     """
     for rule, solver in fits.items():
         yield Trial(STAGE, f"{rule}: a usual cloud", partial(fitted, solver, cloud()), measure="rad")

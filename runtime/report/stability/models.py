@@ -1,12 +1,12 @@
 """Cases that test the models on stiff problems, and on extreme pictures, poses and sizes.
 
 The stiff part of the two-eye problem is the lowest frequency of the difference between the eyes: one cycle across the
-panels, which the outer panels must carry by their parallax. Its eigenvalue is 3 - |1 + exp(2iks_0) + exp(2iks_2)|. The
-target contains that wave, finer waves, and a part common to both eyes that any panel can show. This module traces rays
-through a model's panels and compares the residual with the exact least-squares solution within the panels' range
-(scipy). Neither computation shares code with the models.
+panels, which the outer panels must carry through their parallax. Its eigenvalue is 3 - |1 + exp(2iks_0) + exp(2iks_2)|.
+The target contains that wave, finer waves, and a part common to both eyes that any panel can show. This module traces
+rays through a model's panels and compares the residual with that of the exact least-squares solution within the panels'
+range (scipy). Neither computation shares code with the models.
 
-The other problems have no closed form. Their errors are compared with recorded errors.
+The other problems have no closed-form solution. Their errors are compared with recorded ones.
 """
 
 from __future__ import annotations
@@ -33,22 +33,22 @@ SOLVE, NETWORK = "solve", "network"
 MODELS = ("fast", "balanced", "best")
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 192, 108)
 FOV_DEG = 40.0
-AMPLITUDE = 0.1  # amplitude of the target difference between the eyes at its lowest frequency, in units of pi/2
-FINER = ((5, 0.05), (11, 0.03))  # further waves of the difference, as (cycles across the panels, amplitude)
-COMMON = ((3, 0.15), (7, 0.1))  # waves of the part common to both eyes, as (cycles across the panels, amplitude)
+AMPLITUDE = 0.1  # amplitude of the target difference between the eyes, at its lowest frequency, in units of pi/2
+FINER = ((5, 0.05), (11, 0.03))  # further waves in the difference, as (cycles across the panels, amplitude)
+COMMON = ((3, 0.15), (7, 0.1))  # waves in the part common to both eyes, as (cycles across the panels, amplitude)
 WIDTH_M, HEIGHT_M, WIDTH_PX, HEIGHT_PX = 0.5184, 0.0648, 64, 8
 SOLVE_FLOOR = 0.002  # an 8-bit grey level on one of three panels, relative to the target
-NETWORK_FLOOR = 0.0005  # an eighth of an 8-bit code value, for different rounding on other processors
+NETWORK_FLOOR = 0.0005  # an eighth of an 8-bit code value, to allow for different rounding on other processors
 
 
 @lru_cache(maxsize=4)
 def ready(model: str, stack: PanelStack) -> Predictor:
-    """Return the predictor of a model. Predictors are cached, because most cases share the same panels."""
+    """Return a model's predictor. Predictors are cached, because most cases share the same panels."""
     return load_predictor(model, stack, ModelSettings(threads=1))
 
 
 def layers_of(model: str, images: Sequence[U8], eyes_m: F64, stack: PanelStack, *, fov_deg: float = FOV_DEG) -> U8:
-    """Solve a pair of pictures, and return a copy of the layers, shape (N, h, w, 3)."""
+    """Solve a pair of pictures, and return a copy of the layers with shape (N, h, w, 3)."""
     still = solve_still(images[0], images[1], eyes_m=eyes_m, fov_deg=fov_deg, predictor=ready(model, stack))
     return np.array(still.layers[..., :3])
 
@@ -57,7 +57,7 @@ def waves(parts: Sequence[tuple[int, float]]) -> F64:
     """Return a sum of sine waves across a row, shape (WIDTH_PX,).
 
     Args:
-        parts: Waves, each with the number of cycles across the row and the amplitude. The phases differ.
+        parts: Waves, each given by its number of cycles across the row and its amplitude. The phases differ.
     """
     u = (np.arange(WIDTH_PX) + 0.5) / WIDTH_PX
     result: F64 = np.sum([size * np.sin(2 * np.pi * cycles * u + cycles - 1) for cycles, size in parts], axis=0)
@@ -68,7 +68,7 @@ def hats(positions: F64, count: int) -> F64:
     """Return the weights of linear interpolation between values at 0, 1, ..., count - 1.
 
     Args:
-        positions: Positions at which to interpolate, shape (n,).
+        positions: Positions to interpolate at, shape (n,).
         count: Number of values.
 
     Returns:
@@ -80,7 +80,7 @@ def hats(positions: F64, count: int) -> F64:
 
 @dataclass(frozen=True)
 class StiffProblem:
-    """Problem with a stiff part, whose targets are a common grey picture plus a difference between eyes.
+    """A problem with a stiff part. The targets are a common grey picture plus a difference between eyes.
 
     Both eyes look at three panels from straight ahead. The rays are traced independently of the models.
     """
@@ -91,11 +91,11 @@ class StiffProblem:
 
     @property
     def eye_x_m(self) -> float:
-        """Distance of the eyes from the middle panel, in metres."""
+        """Distance from the middle panel to the eyes, in metres."""
         return self.gap_m + self.distance_m
 
     def target(self, side: int) -> F64:
-        """Return the target phase of each column for the left (0) or right (1) eye, shape (WIDTH_PX,)."""
+        """Return each column's target phase for the left (0) or right (1) eye, shape (WIDTH_PX,)."""
         return 1.5 + waves(COMMON) + (side - 0.5) * waves([(1, AMPLITUDE), *FINER])
 
     def condition(self) -> float:
@@ -111,15 +111,15 @@ class StiffProblem:
             side: 0 for the left eye, 1 for the right eye.
 
         Returns:
-            A pair. The first item lists, for each panel from rear to front, the interpolation weights of the panel's
-            rows, shape (n, HEIGHT_PX), and of its columns, shape (n, WIDTH_PX). The second item contains the target
-            phases of the n rays.
+            A pair. The first item lists, for each panel from rear to front, the interpolation weights for the panel's
+            rows, shape (n, HEIGHT_PX), and for its columns, shape (n, WIDTH_PX). The second item contains the n rays'
+            target phases.
         """
         v, u = np.mgrid[0:HEIGHT_PX, 0:WIDTH_PX] + 0.5
         focal_px = WIDTH_PX * self.eye_x_m / WIDTH_M
         eye = np.array([self.eye_x_m, (side - 0.5) * self.ipd_m])
         back, across = eye / np.hypot(*eye), (u - WIDTH_PX / 2) / focal_px
-        x, y = -back[0] - across * back[1], -back[1] + across * back[0]  # directions of the rays; the z axis points up
+        x, y = -back[0] - across * back[1], -back[1] + across * back[0]  # ray directions; the z axis points up
         z = -(v - HEIGHT_PX / 2) / focal_px
         positions, inside = [], np.ones(u.shape, bool)
         for x_m in (-self.gap_m, 0.0, self.gap_m):
@@ -132,7 +132,7 @@ class StiffProblem:
         return weights, np.broadcast_to(self.target(side), u.shape)[inside]
 
     def residual(self, layers: F64) -> float:
-        """Return the RMS residual over the rays of both eyes, relative to the variation of the targets.
+        """Return the RMS residual over both eyes' rays, relative to the variation in the targets.
 
         The variation is the RMS deviation from 1.5, the mean phase.
 
@@ -152,9 +152,9 @@ class StiffProblem:
 
 @lru_cache(maxsize=64)
 def optimum(problem: StiffProblem) -> float:
-    """Return the smallest residual of panels with equal rows and values in [0, 1].
+    """Return the smallest residual that panels with equal rows and values in [0, 1] can leave.
 
-    The rows are equal because the rows of the targets are equal.
+    The rows are equal because the targets' rows are equal.
     """
     parts = [problem.rays(side) for side in (0, 1)]
     targets = np.concatenate([target for _, target in parts])
@@ -164,7 +164,7 @@ def optimum(problem: StiffProblem) -> float:
 
 
 def solved(model: str, problem: StiffProblem) -> Answer:
-    """Compare the residual of a model with the smallest possible residual (`optimum`)."""
+    """Compare a model's residual with the smallest possible one (`optimum`)."""
     stack = PanelStack(WIDTH_M, HEIGHT_M, (-problem.gap_m, 0.0, problem.gap_m), WIDTH_PX, HEIGHT_PX)
     eyes_m = np.array([[problem.eye_x_m, side * problem.ipd_m / 2, 0.0] for side in (-1, 1)])
     greys = [np.rint(255 * np.sin(np.pi / 2 * problem.target(side)) ** 2).astype(np.uint8) for side in (0, 1)]
@@ -175,12 +175,12 @@ def solved(model: str, problem: StiffProblem) -> Answer:
     note = f"no panels leave less than {least:.3g}"
     if residual < 0.8 * least - SOLVE_FLOOR:  # rows that differ slightly can be somewhat better than the optimum
         return Answer(math.nan, 1.0, problem.condition(), note=f"{residual:.3g} is impossible: {note}")
-    # A model that alternates between the eyes leaves the whole error to one eye. Flat grey is the worst case.
+    # A model that alternates between the eyes leaves the entire error to one eye. Flat grey is the worst case.
     return Answer(residual, 1.0, problem.condition(), residual - least, note=note)
 
 
 def pictures(kind: str) -> list[U8]:
-    """Return the two eyes' pictures of a kind in KINDS, shape (h, w, 3)."""
+    """Return the two eyes' pictures, each (h, w, 3), for a kind in KINDS."""
     shape = (STACK.height_px, STACK.width_px, 3)
     left, right = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
     match kind:
@@ -199,7 +199,7 @@ def pictures(kind: str) -> list[U8]:
     return [left, right]
 
 
-# Extreme pictures. Each pair is seen from straight ahead, and from this distance (metres) and off-axis angle (degrees).
+# Extreme pictures. Each pair is seen from straight ahead, and from the given distance (m) and off-axis angle (degrees).
 KINDS = {
     "all black": (0.7, 15.0), "all white": (0.9, -25.0), "lines one pixel wide": (1.5, -35.0),
     "black for one eye, white for the other": (0.7, 15.0), "noise, another for each eye": (0.9, -25.0),
@@ -208,7 +208,7 @@ KINDS = {
 
 
 def smooth(stack: PanelStack) -> list[U8]:
-    """Return a smooth picture, shape (h, w, 3), and the same picture shifted by a pixel."""
+    """Return a smooth picture, shape (h, w, 3), and the same picture shifted by one pixel."""
     y, x = np.mgrid[0 : stack.height_px, 0 : stack.width_px]
     wave = 128 + 90 * np.sin(x / stack.width_px * 19) * np.cos(y / stack.height_px * 11)
     left = np.repeat(wave[..., None], 3, axis=2).astype(np.uint8)
@@ -218,14 +218,14 @@ def smooth(stack: PanelStack) -> list[U8]:
 def stressed(
     model: str, images: Sequence[U8], eyes_m: F64, stack: PanelStack = STACK, *, light: bool = False
 ) -> Answer:
-    """Measure the RMS error of the displayed pictures.
+    """Measure the displayed pictures' RMS error.
 
     Args:
-        model: Name of the model.
-        images: Target pictures of the left and right eye, shape (h, w, 3).
-        eyes_m: Left and right eye, shape (2, 3), frame `stack`.
-        stack: Geometry of the panels.
-        light: Measure light (docs/contracts.md, Error) instead of one ray per pixel.
+        model: Model name.
+        images: Target pictures for the left and right eyes, shape (h, w, 3).
+        eyes_m: Left and right eyes, shape (2, 3), in the `stack` frame.
+        stack: Panel geometry.
+        light: Measure light (docs/contracts.md, Error) rather than one ray per pixel.
     """
     layers = layers_of(model, images, eyes_m, stack)
     if layers.shape != (3, stack.height_px, stack.width_px, 3) or layers.dtype != np.uint8:
@@ -236,10 +236,10 @@ def stressed(
 
 
 def trials(*, full: bool = False) -> Iterator[Trial]:
-    """Yield all trials of the models.
+    """Yield all trials for the models.
 
     Args:
-        full: Test poses, gaps and panel sizes with every model instead of only `balanced`, and add 4K panels.
+        full: Test poses, gaps and panel sizes with every model rather than only `balanced`, and add 4K panels.
     """
     geometries: dict[str, dict[str, float]] = {
         **{f"gap {gap:g} m": {"gap_m": gap} for gap in (1e-4, 5e-3, 0.03, 0.1, 1.0)},
@@ -271,7 +271,7 @@ def trials(*, full: bool = False) -> Iterator[Trial]:
             yield case(model, f"panels {gap_m:g} m apart", smooth(stack), eyes_at(distance_m=0.6 + gap_m), stack)
         for width, height in ((16, 16), (17, 31), (333, 77), *(((3840, 2160),) if full else ())):
             stack = replace(STACK, width_px=width, height_px=height)
-            # At 333x77, a panel row shows the mean of three picture rows, which a single ray does not represent.
+            # At 333x77, each panel row shows the mean of three picture rows, which a single ray cannot represent.
             flat = (width, height) == (333, 77)
             yield case(model, f"panels of {width}x{height}", smooth(stack), eyes_at(distance_m=0.6), stack, light=flat)
     far_aside = partial(stressed, "balanced", smooth(STACK), eyes_at(distance_m=3.0, angle_deg=85.0))

@@ -1,7 +1,7 @@
 """Cases for poses, projections and Malus' law at singularities (supplement, (1)-(14), (40)-(47)).
 
-The references are different formulas, evaluated in extended precision (`np.longdouble`, whose significand has 64 bits
-or more on the supported machines). The tolerances are multiples of the rounding error of a double.
+The references use different formulas, evaluated in extended precision (`np.longdouble`, whose significand has 64 bits
+or more on the supported machines). The tolerances are multiples of a double's rounding error.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ POSE, RPU, PHASE, JONES = "eye pose", "RPU", "phase", "Jones optics"
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 1920, 1080)
 FOV_DEG = 40.0
 PROBES = [(a, b) for a in (0.1, 0.5, 0.9) for b in (0.2, 0.8)]  # positions on a panel, as fractions of its size
-STEP = 1e-10  # relative step of the differences that estimate a condition number
+STEP = 1e-10  # relative step for the finite differences used to estimate condition numbers
 INTENSITIES = {
     "0": 0.0, "the least subnormal": 5e-324, "1e-300": 1e-300, "1e-16": 1e-16, "1e-8": 1e-8, "1/255": 1 / 255,
     "1/2": 0.5, "254/255": 254 / 255, "1 - 1e-8": 1 - 1e-8, "1 - 1e-12": 1 - 1e-12,
@@ -45,9 +45,9 @@ def farthest(values: Any, reference: Any) -> float:
 
 
 def axes(eye: Any) -> Any:
-    """Return the right, up and back axes of an eye's pose as rows, in extended precision ((10)-(13)).
+    """Return an eye pose's right, up and back axes as rows, in extended precision ((10)-(13)).
 
-    For an eye on the vertical axis, the result is the limit from +x.
+    For an eye on the vertical axis, the result is the limit when approached from +x.
     """
     back = eye / np.abs(eye).max()
     back = back / np.sqrt(back @ back)
@@ -57,18 +57,18 @@ def axes(eye: Any) -> Any:
 
 
 def focal_px(width_px: int) -> Any:
-    """Return the focal length of an eye's image in pixels, in extended precision."""
+    """Return an eye image's focal length in pixels, in extended precision."""
     return width_px / 2 / np.tan(PI * FOV_DEG / 360)
 
 
 def image_position(eye: Any, point: Any, stack: PanelStack) -> Any:
-    """Return the pixel position (u, v) of a point in an eye's image. Eye and point are in frame `stack`."""
+    """Return a point's pixel position (u, v) in an eye's image. Eye and point are in the `stack` frame."""
     right, up, back = axes(eye) @ (point - eye)
     return focal_px(stack.width_px) / -back * extended([right, -up]) + extended([stack.width_px, stack.height_px]) / 2
 
 
 def panel_position(eye: Any, image: Any, stack: PanelStack, index: int) -> Any:
-    """Trace the ray through a pixel position of an eye's image to its pixel position (u, v) on a panel."""
+    """Trace the ray through a pixel position in an eye's image to its pixel position (u, v) on a panel."""
     u, v = (image - extended([stack.width_px, stack.height_px]) / 2) / focal_px(stack.width_px)
     direction = extended([u, -v, -1]) @ axes(eye)
     _, right, up = eye + (stack.x_m[index] - eye[0]) / direction[0] * direction
@@ -76,7 +76,7 @@ def panel_position(eye: Any, image: Any, stack: PanelStack, index: int) -> Any:
 
 
 def pose(eye: Sequence[float]) -> Answer:
-    """Compare the rotation of an eye's pose with the reference.
+    """Compare an eye pose's rotation with the reference.
 
     The condition number grows as the eye approaches the vertical axis.
     """
@@ -88,7 +88,7 @@ def pose(eye: Sequence[float]) -> Answer:
 
 
 def gaze(eye: Sequence[float]) -> Answer:
-    """Compare the image positions of the stack's origin and of a nearby point with the reference."""
+    """Compare the image positions of the stack's origin and a nearby point with the reference."""
     projection = image_from_stack(eye, width_px=STACK.width_px, height_px=STACK.height_px, fov_deg=FOV_DEG)
     size, error = max(map(abs, eye)), 0.0
     for point in ((0.0, 0.0, 0.0), (0.125 * size, -0.25 * size, 0.0625 * size)):
@@ -111,8 +111,8 @@ def scale_shift(eye: Sequence[float], to_x_m: float) -> Answer:
 def followed(eye: Sequence[float], *, index: int = 2, stack: PanelStack = STACK) -> Answer:
     """Compare the homography M_RPU (47) with ray tracing, at image positions whose rays cross the panel.
 
-    The condition number is the rate, in panel widths, at which the position on the panel changes with relative changes
-    of the image position or of the eye's position.
+    The condition number says how fast the position on the panel changes, in panel widths, for relative changes in the
+    image position or the eye's position.
     """
     view: Any = {"width_px": stack.width_px, "height_px": stack.height_px, "fov_deg": FOV_DEG}
     m = panel_from_image(image_from_stack(eye, **view), stack.panel(index))
@@ -138,7 +138,7 @@ def of_intensity(intensity: float, branch: Literal[1, 2]) -> Answer:
     root = np.arcsin(np.sqrt(extended(intensity))) * 2 / PI
     truth = root if branch == 1 else 2 - root
     phase = phase_from_intensity(np.array(intensity), branch)
-    # Relative condition number of asin(sqrt(I)). Near an intensity of 1, the spacing of doubles bounds the number.
+    # Relative condition number of asin(sqrt(I)). Near an intensity of 1, it is bounded by the spacing of doubles.
     away = max(1 - intensity, EPS64)
     condition = max(1.0, math.sqrt(intensity / away) / math.pi / max(float(truth), 1e-30))
     back = abs(float(intensity_from_phase(phase)) - intensity)
@@ -167,7 +167,7 @@ def product(values: Sequence[float]) -> Answer:
 
 
 def trials() -> Iterator[Trial]:
-    """Yield all trials of the optics."""
+    """Yield all trials for the optics."""
     for power in [*range(1, 13), 100, 300]:
         angle = 10.0**-power
         eye = [0.6 * math.sin(angle) * math.cos(0.7), 0.6 * math.sin(angle) * math.sin(0.7), 0.6 * math.cos(angle)]

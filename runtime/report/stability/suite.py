@@ -1,7 +1,7 @@
-"""Complete suite of the trials of all stages.
+"""The complete suite of trials for all stages.
 
-The models and the tracker have cases without a closed form, whose errors are compared with the errors recorded in
-`limits.json`. After a change of the models or the tracker, record the errors again with
+Some cases for the models and the tracker have no closed-form solution, so their errors are compared with those recorded
+in `limits.json`. After changing the models or the tracker, record the errors again with
 `phasestack stability --full --record FILE`, and explain in the commit what became worse.
 """
 
@@ -17,15 +17,15 @@ from runtime.report.stability.calibration import Fit
 from runtime.report.stability.trial import Case, Trial, settle
 from runtime.support.artifacts import write_text
 
-LIMITS = Path(__file__).with_name("limits.json")  # recorded forward errors by `Trial.key`
+LIMITS = Path(__file__).with_name("limits.json")  # recorded forward errors, keyed by `Trial.key`
 
 
 def every_trial(fits: Mapping[str, Fit], *, full: bool) -> Iterator[Trial]:
-    """Yield the trials of all stages.
+    """Yield the trials for all stages.
 
     Args:
-        fits: Solvers of the calibration by method name.
-        full: Include the trials that take long.
+        fits: Calibration solvers, keyed by method name.
+        full: Include trials that take a long time.
     """
     yield from optics.trials()
     yield from models.trials(full=full)
@@ -40,8 +40,8 @@ def run(
 
     Args:
         trials: Trials to run.
-        record: File to which the recorded errors are written, updated by the measured errors. None: write no file.
-        progress: Function that is called after each trial with the number of finished trials and of all trials.
+        record: File to write the recorded errors to, updated with the measured ones. None: write no file.
+        progress: Function called after each trial with the number of trials finished and the total number.
     """
     limits: dict[str, float] = json.loads(LIMITS.read_text(encoding="utf-8"))
     cases = []

@@ -1,4 +1,4 @@
-"""Cases that test the tracker at extreme time steps, with a head whose positions are known exactly."""
+"""Cases that test the tracker with extreme time steps and a head whose positions are known exactly."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from runtime.report.stability.trial import Answer, Trial
 STAGE = "tracker"
 EYES_M = np.array([[0.6, -0.031, 0.05], [0.6, 0.032, 0.05]])
 FRAME_NS = NS_PER_S // 30
-TRAVEL_M = np.array([0.02, 0.09, -0.04])  # movement of the head during a case, reduced to keep below FASTEST
-FASTEST = 0.3  # maximum speed of the head, m/s
-FLOOR_M = 1e-6  # difference that another machine's rounding may cause
+TRAVEL_M = np.array([0.02, 0.09, -0.04])  # the head's movement during a case, reduced to stay below FASTEST
+FASTEST = 0.3  # the head's maximum speed, m/s
+FLOOR_M = 1e-6  # difference that may be due to another machine's rounding
 
 
 def head_m(time_ns: int, *, span_ns: int) -> F64:
-    """Return the left and right eye, shape (2, 3), frame `stack`, of a head in uniform motion.
+    """Return the left and right eyes of a uniformly moving head, shape (2, 3), in the `stack` frame.
 
     Args:
-        time_ns: Time since the start of the motion.
-        span_ns: Time in which the head moves by TRAVEL_M, or by less if the head would exceed FASTEST.
+        time_ns: Time since the motion started.
+        span_ns: Time taken to move by TRAVEL_M, or by less if the head would otherwise exceed FASTEST.
     """
     share = min(1.0, FASTEST * span_ns / NS_PER_S / float(np.linalg.norm(TRAVEL_M)))
     return EYES_M + TRAVEL_M * share * (time_ns / max(span_ns, 1))
 
 
 def still(updates: int) -> Answer:
-    """Measure the error of the tracked eyes after a number of updates, most of them from a head at rest."""
+    """Measure the tracked eyes' error after a number of updates, most of them from a head at rest."""
     tracker, span_ns = Tracker(), 30 * FRAME_NS
     for index in range(updates):
         eyes = head_m(min(index * FRAME_NS, span_ns), span_ns=span_ns)
@@ -44,12 +44,12 @@ def still(updates: int) -> Answer:
 
 
 def after(steps_ns: list[int], ahead_ns: int, *, lost: bool = False) -> Answer:
-    """Measure the error of the predicted eyes of a head that was sampled at irregular intervals.
+    """Measure the predicted eyes' error for a head that was sampled at irregular intervals.
 
     Args:
         steps_ns: Intervals between the samples.
-        ahead_ns: Time from the last sample to the predicted instant.
-        lost: The last sample is too old for a prediction. The tracker must give no position.
+        ahead_ns: Time from the last sample to the instant to predict.
+        lost: The last sample is too old to predict from, so the tracker must return no position.
     """
     tracker, now_ns, span_ns = Tracker(), 0, sum(map(abs, steps_ns)) + ahead_ns
     for step_ns in (0, *steps_ns):
@@ -64,7 +64,7 @@ def after(steps_ns: list[int], ahead_ns: int, *, lost: bool = False) -> Answer:
 
 
 def trials(*, full: bool = False) -> Iterator[Trial]:
-    """Yield all trials of the tracker.
+    """Yield all trials for the tracker.
 
     Args:
         full: Include a trial with a million updates.

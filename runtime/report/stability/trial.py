@@ -1,6 +1,6 @@
-"""Trials, which are extreme cases to be run, and their outcomes.
+"""Trials (extreme cases to run) and their outcomes.
 
-Running a trial gives an outcome (`Case`) even if the tested code raises an exception.
+Running a trial yields an outcome (`Case`) even if the tested code raises an exception.
 """
 
 from __future__ import annotations
@@ -15,42 +15,42 @@ from runtime.errors import PhasestackError
 
 Behaviour = Literal["answers", "refuses"]
 EPS64 = 2.0**-52
-WORSE = 1.05  # maximum accepted ratio of an error to the recorded error
+WORSE = 1.05  # largest accepted ratio of an error to the recorded error
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """Error of a computed result compared with the reference, and the error that is acceptable."""
+    """A computed result's error relative to the reference, and the error that is acceptable."""
 
-    forward_error: float  # error of the result, in the trial's measure
-    tolerance: float  # maximum forward error that passes, fixed before the trial is run
-    condition: float = 1.0  # factor by which the problem itself amplifies a relative error of its input
-    backward_error: float | None = None  # change of the input that explains the result; None: equal to forward_error
+    forward_error: float  # the result's error, in the trial's measure
+    tolerance: float  # maximum forward error that passes, set before the trial is run
+    condition: float = 1.0  # how much the problem itself amplifies a relative error in its input
+    backward_error: float | None = None  # change in the input that explains the result; None: same as forward_error
     note: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """Extreme case that has not been run yet, with the criterion for passing."""
+    """An extreme case that has not been run yet, with its criterion for passing."""
 
     stage: str
     name: str
     run: Callable[[], Answer]
     expected: Behaviour = "answers"
-    measure: str = "relative"  # unit of the forward error
-    # If set, the recorded error also limits the forward error. The value is the part of the forward error, in the
-    # trial's measure, that may come from another machine's rounding.
+    measure: str = "relative"  # the forward error's unit
+    # If set, the recorded error also limits the forward error. The value is how much of the forward error, in the
+    # trial's measure, may be due to another machine's rounding.
     floor: float | None = None
 
     @property
     def key(self) -> str:
-        """Key of the trial in the file of recorded errors."""
+        """The trial's key in the file of recorded errors."""
         return f"{self.stage}: {self.name}"
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """Outcome of a trial, an entry of `stability.json`."""
+    """A trial's outcome: an entry in `stability.json`."""
 
     name: str
     stage: str
@@ -65,14 +65,14 @@ class Case:
 
 
 def settle(trial: Trial, *, limit: float | None = None) -> Case:
-    """Run a trial and return the outcome. An exception of the tested code is part of the outcome.
+    """Run a trial and return its outcome. An exception raised by the tested code is part of the outcome.
 
-    A trial that expects a refusal passes if the code raises an error of the project or a ValueError. Every other
-    exception fails the trial.
+    A trial that expects a refusal passes if the code raises one of the project's errors or a ValueError. With any other
+    exception, the trial fails.
 
     Args:
         trial: Trial to run.
-        limit: Recorded forward error. A trial with a floor fails if no error is recorded.
+        limit: Recorded forward error. A trial that has a floor fails if no error is recorded.
     """
     try:
         with warnings.catch_warnings():
