@@ -77,9 +77,12 @@ def solve_arguments(folder: Path, **changes: object) -> list[str]:
         ({"left_eye": (0.6, 1e30, 0)}, "--left-eye: 1e+30 m is beyond 50 m"),
         (
             {"left_eye": (0.6, 0, 0), "right_eye": (0.66, 0, 0), "model": "fast"},
-            "--right-eye: the eyes have no horizontal separation",
+            "--right-eye: fast does not support these eye positions (the eyes have no horizontal separation",
         ),
-        ({"left_eye": (50, 50, 50), "right_eye": (0.07, -50, -50), "model": "fast"}, "--right-eye: implausible"),
+        (
+            {"left_eye": (50, 50, 50), "right_eye": (0.07, -50, -50), "model": "fast"},
+            "--right-eye: fast does not support these eye positions (implausible",
+        ),
         ({"fov": 180}, "--fov"),
         ({"fov": 1e-320}, "--fov"),
         ({"model": "quick"}, "solve: --model: 'quick'"),
@@ -161,7 +164,7 @@ def test_one_view_is_refused_and_so_is_a_layout_for_two_files(pair: Path) -> Non
     arguments = solve_arguments(pair)
     at = arguments.index("--right")
     assert "left.png: layout: holds 1 view: give --right, or --layout" in refusal(*arguments[:at], *arguments[at + 2 :])
-    assert "solve: --layout: requires one file with both views" in refusal(*arguments, "--layout", "side-by-side")
+    assert "solve: --layout: cannot be combined with --right" in refusal(*arguments, "--layout", "side-by-side")
     assert "--layout: layout" in refusal("run", "--replay", "demo", "--headless", "--layout", "sideways")
 
 

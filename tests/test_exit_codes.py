@@ -73,7 +73,7 @@ def test_an_error_in_a_thread_is_told_so_too(tmp_path: Path) -> None:
 
 def test_without_memory_it_may_pass(tmp_path: Path) -> None:
     answer = broken("raise MemoryError", tmp_path)
-    assert (answer.returncode, answer.stderr) == (75, "phasestack: out of memory; try again\n")
+    assert (answer.returncode, answer.stderr) == (75, "phasestack: out of memory; close other programs and try again\n")
 
 
 @pytest.mark.parametrize(("error", "code"), [("FatalError", 2), ("PanelLost", 75)])

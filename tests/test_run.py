@@ -253,7 +253,7 @@ def test_the_demo_ends_in_time_and_names_its_simulated_clock(tmp_path: Path, mon
     with pytest.raises(SystemExit):
         app(["demo", "--out", str(tmp_path)])
     summary = json.loads((tmp_path / "summary.json").read_text())
-    assert summary["frames"] == 4 and summary["light_db"] and "0 s is up" in summary["stopped"]
+    assert summary["frames"] == 4 and summary["light_db"] and "reached the time limit of" in summary["stopped"]
     assert (summary["clock"], summary["scene"]) == ("simulated", "room")
     assert list(summary)[:2] == ["clock", "configured"]
 

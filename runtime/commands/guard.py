@@ -91,7 +91,7 @@ def _reported(error: BaseException) -> int:
         _say(f"phasestack: {one_line(str(error), most=2000)}")
         return MAY_PASS if isinstance(error, TransientError) else BAD_INPUT
     if isinstance(error, MemoryError):
-        _say("phasestack: out of memory; try again")
+        _say("phasestack: out of memory; close other programs and try again")
         return MAY_PASS
     from runtime.support.crash import written
 

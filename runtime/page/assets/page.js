@@ -292,7 +292,7 @@ function show(status) {
   document.body.dataset.known = "now";
   const hangs = status.turn_age_s > 5;
   $("gone").hidden = !hangs;
-  if (hangs) setText($("gone"), `the display loop has hung for ${number(status.turn_age_s, 0)} s`);
+  if (hangs) setText($("gone"), `the display loop has not responded for ${number(status.turn_age_s, 0)} s`);
   const reason = status.reason ?? "", late = /solutions take|has not answered for/.test(reason);
   setText($("state"), hangs ? "hangs" : late ? "late" : status.state ?? "starting");
   $("state").dataset.state = hangs ? "gone" : late ? "holding" : (status.state ?? "starting").split(":")[0];
