@@ -30,7 +30,11 @@ PANEL = '[[output.panels]]\nconnector = "DP-{}"\n'
         ("[stack]\nx_m = [0.0, 1e-9, 0.06]", "stack.x_m", "apart; the minimum is"),
         ("[stack]\nwidth_m = 1e-30", "stack.width_m", "below 0.005 m"),
         ("[stack]\nwidth_m = 1e308", "stack.width_m", "beyond 20 m"),
-        ("[stack]\nheight_m = 0.5", "stack.height_m", "did you mean height_m = 0.2916? (or set stack.pixel_aspect)"),
+        (
+            "[stack]\nheight_m = 0.5",
+            "stack.height_m",
+            "did you mean height_m = 0.2916? Otherwise change stack.pixel_aspect",
+        ),
         ("[calibration]\nipd_m = 6.3", "calibration.ipd_m", "did you mean centimetres (0.063)?"),
         ("[calibration]\nviewing_m = [400, 600]", "calibration.viewing_m.0", "did you mean millimetres (0.4)?"),
         ("[tracker]\nhold_s = 500", "tracker.hold_s", "did you mean milliseconds (0.5)?"),
