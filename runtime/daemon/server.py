@@ -160,10 +160,10 @@ class StatusServer:
         if len(self._clients) >= CLIENTS_MAX:
             longest = next(iter(self._reading), None)
             if longest is None:
-                raise Refusal("too many clients")
+                raise Refusal("too many clients are connected")
             self._reading.pop(longest)
             self._clients.discard(longest)  # before its task ends, because more clients may connect
-            longest.cancel("too many clients")
+            longest.cancel("too many clients are connected")
 
     async def _request(self, reader: StreamReader, task: asyncio.Task[None]) -> bytes:
         """Return the next request with its newline, or the incomplete rest of the input.
@@ -200,7 +200,7 @@ class StatusServer:
 
 def _log_error(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
     """Log an error such as a lack of file descriptors, after which asyncio retries."""
-    log.warning("status: %s", one_line(f"{context.get('message')} ({context.get('exception')})"))
+    log.warning("status socket: %s", one_line(f"{context.get('message')} ({context.get('exception')})"))
 
 
 def _line(answer: dict[str, Any]) -> bytes:
@@ -225,7 +225,7 @@ async def _outcome(command: Command, writer: StreamWriter) -> dict[str, Any]:
         while not done and time.monotonic() < until_s and not _is_gone(writer):
             done, _ = await asyncio.wait({answer}, timeout=min(LOOKED_AGAIN_S, LOOP_ANSWERS_WITHIN_S))
         if not done and command.answer.cancel():
-            problem = f"the display loop did not answer within {LOOP_ANSWERS_WITHIN_S:g} s; the command was not run"
+            problem = f"the display loop did not answer within {LOOP_ANSWERS_WITHIN_S:g} s, so the command was not run"
             return {"ok": False, "error": problem}
         done, _ = await asyncio.wait({answer}, timeout=LOADED_WITHIN_S)
     except asyncio.CancelledError as stops:

@@ -45,7 +45,7 @@ def judge(conditions: Conditions) -> tuple[State, str]:
         return State.FLAT, "; ".join(["no viewer", *late])
     remarks = [*late, *(["the picture is paused"] if conditions.paused else [])]
     if conditions.limited:
-        remarks.append(f"alignment at its limit until the next solution: {conditions.limited}")
+        remarks.append(f"the alignment has reached its limit until the next solution: {conditions.limited}")
     if conditions.eyes == "held":
         return State.HOLDING, "; ".join(["eyes lost; keeping the last position", *remarks])
     return State.TRACKING, "; ".join(["eyes seen", *remarks])
@@ -103,7 +103,7 @@ class Lateness:
         self._told_ns = 0
 
     def update(self, *, presented: bool, now_ns: int) -> str:
-        """Count a refresh. Return "" if on time, otherwise `late: 38 of 60 refreshes a second`.
+        """Count a refresh. Return "" if on time, otherwise `late: 38 of 60 refreshes per second`.
 
         The message is updated once a second.
         """
@@ -121,5 +121,5 @@ class Lateness:
         elif self._few_since_ns is None:
             self._few_since_ns = now_ns
         elif now_ns - self._few_since_ns > WINDOW_NS and (not self._told or now_ns - self._told_ns >= WINDOW_NS):
-            self._told, self._told_ns = f"late: {count} of {self._wanted:.0f} refreshes a second", now_ns
+            self._told, self._told_ns = f"late: {count} of {self._wanted:.0f} refreshes per second", now_ns
         return self._told

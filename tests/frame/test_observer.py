@@ -486,6 +486,6 @@ def test_who_stops_a_run_waits_for_no_kept_picture(
         observer.sampled(sample(NS_PER_S + number * PERIOD_NS))
         observer.refreshed(refresh(number, solved))
     observer.finish(lambda: True)
-    assert "3 of 3 refreshes with kept light have no" in caplog.text
+    assert "3 of 3 refreshes kept by --keep-light have no" in caplog.text
     assert all({"layers", "info"} <= light.keys() for light in kept.lights.values())
     assert kept.lights[2]["info"]["true_eyes_m"] is not None
