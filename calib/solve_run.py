@@ -41,7 +41,7 @@ def solve_file(
     volume_m = viewing_volume_m(settings.calibration)
     try:
         chosen = (
-            solve(pairs.sensor_m, pairs.stack_m, method=method, known_scale=known_scale, reason="asked for")
+            solve(pairs.sensor_m, pairs.stack_m, method=method, known_scale=known_scale, reason="as requested")
             if method
             else solve_default(pairs.sensor_m, pairs.stack_m)
         )
