@@ -110,7 +110,7 @@ def test_a_decoder_s_complaint_about_a_damaged_picture_is_in_the_line(pair: Path
     result = phasestack(*solve_arguments(pair, left=pair / "damaged.png"))
     assert result.returncode == 2
     (line,) = result.stderr.strip().splitlines()
-    assert "damaged.png: is not an image that can be decoded (it is damaged)" in line
+    assert "damaged.png: cannot be decoded as an image because the file is damaged" in line
 
 
 def test_a_folder_in_a_layer_s_place_is_named_and_nothing_replaced(pair: Path) -> None:
@@ -163,7 +163,9 @@ def test_one_file_that_holds_both_views_is_solved_as_two(pair: Path, name: str, 
 def test_one_view_is_refused_and_so_is_a_layout_for_two_files(pair: Path) -> None:
     arguments = solve_arguments(pair)
     at = arguments.index("--right")
-    assert "left.png: layout: holds 1 view: give --right, or --layout" in refusal(*arguments[:at], *arguments[at + 2 :])
+    assert "left.png: layout: contains 1 view; pass --right or another --layout" in refusal(
+        *arguments[:at], *arguments[at + 2 :]
+    )
     assert "solve: --layout: cannot be combined with --right" in refusal(*arguments, "--layout", "side-by-side")
     assert "--layout: layout" in refusal("run", "--replay", "demo", "--headless", "--layout", "sideways")
 

@@ -45,7 +45,7 @@ def load_compressed_splats(path: Path) -> Gaussians:
         raise
     except Exception:  # zlib, zipfile, zstandard and malformed JSON raise various errors
         kind = "an SPZ" if path.suffix.lower() == ".spz" else "a SOG"
-        raise InputError(path, "", f"is damaged, or not {kind} file") from None
+        raise InputError(path, "", f"is damaged or is not {kind} file") from None
 
 
 def _spz(path: Path) -> Gaussians:
@@ -55,7 +55,7 @@ def _spz(path: Path) -> Gaussians:
     head = zipped.decompress(data, SPZ_SHORT) if zipped else data[: SPZ_HEADER.size]
     mark, version, count, degree, bits, _, _, table = SPZ_HEADER.unpack(head.ljust(SPZ_HEADER.size, b"\0"))
     if mark != b"NGSP" or not 1 <= version <= 4 or degree > 4:
-        raise InputError(path, "", "is not an SPZ file of version 1 to 4")
+        raise InputError(path, "", "is not an SPZ file, or not of version 1 to 4")
     untrusted_input.within(count, LIMITS.splats, source=path, field="splats")
     rest = (degree + 1) ** 2 - 1
     sizes = [count * each for each in (6 if version == 1 else 9, 1, 3, 3, 3 if version < 3 else 4, 3 * rest)]
@@ -66,7 +66,7 @@ def _spz(path: Path) -> Gaussians:
     else:
         blocks = _zstd_blocks(data, table, sizes)
     if [len(block) for block in blocks] != sizes:
-        raise InputError(path, "", f"is cut off: its header declares {count:,} splats")
+        raise InputError(path, "", f"is truncated: the header declares {count:,} splats")
     places, alphas, colours, scales, turns, higher = (np.frombuffer(block, np.uint8) for block in blocks)
     flat = np.asarray((colours.reshape(count, 1, 3) / np.float32(255) - np.float32(0.5)) / SPZ_COLOUR, np.float32)
     return drawable(
@@ -121,7 +121,7 @@ def _sog(path: Path) -> Gaussians:
         meta = untrusted_input.parsed_json(files.read("meta.json"), source=path)
         if meta.get("version") != 2:
             version = untrusted_input.shown(meta.get("version", 1))
-            raise InputError(path, "meta.json", f"is SOG version {version}; only version 2 is supported")
+            raise InputError(path, "meta.json", f"has SOG version {version}, but only version 2 is supported")
         count = int(meta["count"])
         untrusted_input.within(count, LIMITS.splats, source=path, field="splats")
         low, high, scales, turns, flat = (
@@ -139,7 +139,7 @@ def _sog(path: Path) -> Gaussians:
             higher = np.array(more["codebook"], np.float32)[entries[label]]
             harmonics = with_higher(harmonics, higher[:, :MOST])
     if 3 * (harmonics.shape[1] - 1) not in COEFFICIENTS:
-        raise InputError(path, "shN", "contains no harmonics of degree 1 to 3")
+        raise InputError(path, "shN", "does not contain harmonics of degree 1 to 3")
     three = (turns[:, :3] / np.float32(255) - np.float32(0.5)) * np.float32(np.sqrt(2))
     return drawable(
         path,
@@ -184,5 +184,5 @@ class _SogFiles:
         """Return the first `count` pixels (count, 4) of an RGBA picture. Raises InputError if it has fewer."""
         pixels = self.picture(name).reshape(-1, 4)[:count]
         if len(pixels) < count:
-            raise InputError(self._path, untrusted_input.shown(name), f"has {len(pixels)} of {count} pixels")
+            raise InputError(self._path, untrusted_input.shown(name), f"has only {len(pixels)} of the {count} pixels")
         return pixels

@@ -139,7 +139,7 @@ def broken_content(folder: Path, broken: str) -> Path:
     return path
 
 
-BROKEN = {"NaN": "vertices: 1 of 3", "missing": "neither a file", "a list": "show[1]: content: scene: "}
+BROKEN = {"NaN": "vertices: 1 of 3", "missing": "not a file", "a list": "show[1]: content: scene: "}
 
 
 def test_content_that_can_t_be_loaded_is_refused_and_the_old_stays(
