@@ -34,7 +34,7 @@ def folder(tmp_path: Path) -> Path:
     ("command", "told"),
     [
         (f"{HEADLESS} --config {{folder}}/fifo.toml", "fifo.toml: is a FIFO"),
-        (f"{HEADLESS} --config {{folder}}/deep.toml", "deep.toml: malformed: nested too deep"),
+        (f"{HEADLESS} --config {{folder}}/deep.toml", "deep.toml: malformed: nested too deeply"),
         (f"{HEADLESS} --config {{folder}}/nul.toml", "sensor.source: contains a NUL"),
         (f"{HEADLESS} --replay {{folder}}/fifo.mcap", "fifo.mcap: is a FIFO"),
         (f"{HEADLESS} --replay /dev/zero", "/dev/zero: is a device"),

@@ -46,7 +46,7 @@ def choose(wanted: Wanted, predictor: Predictor, context: Callable[[], Any]) -> 
     Raises MissingPart (`gl` without OpenGL), InputError (a panel too large for the driver) and ModelFailure.
     """
     if predictor.on_panels(predictor.stack) is None:
-        choice = Choice(_cpu(), f"the only one for {predictor.name}")
+        choice = Choice(_cpu(), f"the only backend that supports {predictor.name}")
     elif wanted == "cpu":
         choice = Choice(_cpu(), "as configured")
     elif wanted == "gl":
@@ -83,7 +83,7 @@ def _faster(predictor: Predictor, made: Callable[[], GlBackend]) -> Choice:
         if gl_ms < cpu_ms:
             return Choice(gl, f"the faster at {times}")
     except PhasestackError as error:
-        return Choice(cpu, f"OpenGL cannot be used: {error}")
+        return Choice(cpu, f"OpenGL is not available: {error}")
     gl.close()
     return Choice(cpu, f"the faster at {times}")
 

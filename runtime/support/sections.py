@@ -51,7 +51,7 @@ def _toml(text: str, path: Path) -> Any:
     except ValueError as error:
         raise InputError(path, "", f"malformed: {error}") from None
     except RecursionError:
-        raise InputError(path, "", "malformed: nested too deep") from None
+        raise InputError(path, "", "malformed: nested too deeply") from None
 
 
 def validated(model: type[M], table: dict[str, Any], *, source: str | Path, folder: Path | None = None) -> M:

@@ -198,7 +198,9 @@ def test_a_panel_wider_than_the_driver_allows_is_refused(gl: GlBackend) -> None:
     stack = replace(STACK, width_px=widest + 8)
     predictor = load_predictor("fast", STACK)
     assert isinstance(predictor, StepPredictor)
-    with pytest.raises(InputError, match=rf"stack: width_px: {widest + 8}: this OpenGL driver allows {widest}"):
+    with pytest.raises(
+        InputError, match=rf"stack: width_px: is {widest + 8}, but this OpenGL driver allows at most {widest}"
+    ):
         choose("gl", predictor.on_panels(stack), lambda: gl.passes.context)
 
 
