@@ -33,7 +33,7 @@ def measured_curve(path: Path) -> F32:
     if not np.isfinite(table).all() or table.min() < 0.0 or table.max() > 1.0:
         raise InputError(path, "values", "must be in [0, 1]")
     if (np.diff(table[:, 0]) <= 0.0).any():
-        raise InputError(path, "phase", "must ascend")
+        raise InputError(path, "phase", "must increase from row to row")
     phases = np.linspace(0.0, 1.0, ENTRIES)
     greys = table[:, 1:] if table.shape[1] == 4 else np.repeat(table[:, 1:2], 3, axis=1)
     return np.stack([np.interp(phases, table[:, 0], greys[:, channel]) for channel in range(3)], axis=1).astype(
