@@ -33,7 +33,7 @@ def test_a_connector_serves_where_no_serial_is_named() -> None:
 
 
 def test_a_missing_serial_is_not_made_up_for_by_its_connector() -> None:
-    with pytest.raises(PanelLost, match=r"panel 0: no monitor has EDID serial Z and connector DP-1 .*DP-1"):
+    with pytest.raises(PanelLost, match=r"panel 0: no monitor has EDID serial Z and connector DP-1; .*DP-1"):
         bind([PanelSettings(edid_serial="Z", connector="DP-1")], [LEFT])
 
 
