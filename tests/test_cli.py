@@ -74,7 +74,7 @@ def solve_arguments(folder: Path, **changes: object) -> list[str]:
         ({"right_eye": (0.6, -0.03, 0.0)}, "--right-eye"),
         ({"right_eye": (0.6, -0.0251, 0.0)}, "--right-eye: is 4.9 mm from the left eye"),
         ({"left_eye": (0.061, 40.0, 0.0), "right_eye": (0.061, 40.06, 0.0)}, "--left-eye"),
-        ({"left_eye": (0.6, 1e30, 0)}, "--left-eye: 1e+30 m is beyond 50 m"),
+        ({"left_eye": (0.6, 1e30, 0)}, "--left-eye: 1e+30 m is out of range; use -50 to 50 m"),
         (
             {"left_eye": (0.6, 0, 0), "right_eye": (0.66, 0, 0), "model": "fast"},
             "--right-eye: fast does not support these eye positions (the eyes have no horizontal separation",

@@ -227,7 +227,7 @@ class Recorder(logging.Handler):
         kind: `asked` or a fault. All requests of a kind that arrive before its file is started share that file.
         """
         if not self._most_ns or self._presenter is None:
-            saved("the black box is switched off (service.blackbox_minutes is 0)", None)
+            saved("the black box is switched off; set service.blackbox_minutes above 0", None)
             return
         with self._waiting_lock:
             self._waiting.setdefault(kind, []).append(saved)
@@ -258,7 +258,7 @@ class Recorder(logging.Handler):
                 make_room(self._folder)
             except OSError as error:
                 log.error("the black box could not be written: %s", error)
-                problem = f"{self._folder}: cannot be written ({error.strerror})"
+                problem = f"{self._folder}: cannot be written: {error.strerror}"
             for saved in listeners:
                 saved(problem, None if problem else self._last_file)
 
@@ -419,7 +419,7 @@ def _find_cut(folder: Path) -> None:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             at = datetime.fromtimestamp(journal.stat().st_mtime, UTC)
             journal.rename(path := _next_name(folder, CUT, at))
-            log.warning("the previous run was killed; its last minutes are in %s", path)
+            log.warning("the previous run did not exit cleanly; its last minutes are in %s", path)
 
 
 def make_room(folder: Path) -> None:

@@ -94,7 +94,7 @@ def _refuse_target(out: Path, *, motion: bool) -> None:
     if not os.path.lexists(out):
         folder = next(folder for folder in out.absolute().parents if os.path.lexists(folder))
         if not os.access(folder, os.W_OK | os.X_OK):
-            raise InputError(out, "--out", "cannot be written (Permission denied)")
+            raise InputError(out, "--out", "cannot be written: Permission denied")
         return
     try:
         if motion and Recording(out).header.driver == "motion":

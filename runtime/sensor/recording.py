@@ -140,7 +140,7 @@ def recording_to(path: Path, header: RecordingHeader, *, max_s: float = MAX_S) -
         if file is not None:
             file.close()
         is_taken = isinstance(error, BlockingIOError)
-        problem = "is being recorded by another process" if is_taken else f"cannot be written ({error.strerror})"
+        problem = "is being recorded by another process" if is_taken else f"cannot be written: {error.strerror}"
         raise InputError(path, "", problem) from None
     try:
         with file:
@@ -155,7 +155,7 @@ def recording_to(path: Path, header: RecordingHeader, *, max_s: float = MAX_S) -
                     part.unlink(missing_ok=True)
     except OSError as error:
         if error.filename is None and error.errno is not None:  # a failed write, such as on a full disk
-            raise InputError(path, "", f"cannot be written ({error.strerror})") from None
+            raise InputError(path, "", f"cannot be written: {error.strerror}") from None
         raise
 
 
@@ -221,7 +221,7 @@ class Recording:
         except (InputError, ImportError):
             raise
         except OSError as error:
-            raise InputError(self.path, "", f"cannot be read ({error.strerror})") from None
+            raise InputError(self.path, "", f"cannot be read: {error.strerror}") from None
         except Exception as error:  # the errors of mcap, lz4 and zstandard for a damaged file
             if self.is_whole:
                 problem = str(error) or type(error).__name__

@@ -231,7 +231,7 @@ def test_automatic_takes_the_faster_one_and_says_what_was_measured(gl: GlBackend
 
 def test_without_opengl_automatic_is_the_processor_and_gl_is_refused() -> None:
     def nothing() -> Any:
-        raise MissingPart("no OpenGL without a screen")
+        raise MissingPart("cannot create an OpenGL context without a screen")
 
     predictor = load_predictor("fast", STACK)
     choice = choose("auto", predictor, nothing)

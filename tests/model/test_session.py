@@ -180,5 +180,5 @@ def test_constants_that_are_worked_out_to_all_memory_are_refused(
 
 def test_a_model_that_takes_for_ever_to_load_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(LIMITS, "load_s", 0.01)
-    with pytest.raises(InputError, match=r"is not ready after 0\.01 s"):
+    with pytest.raises(InputError, match=r"was not loaded within 0\.01 s"):
         ModelSession(saved(shipped(), tmp_path, name="slow"))

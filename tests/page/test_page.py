@@ -245,7 +245,7 @@ def test_connections_that_ask_nothing_shut_nobody_out(page: Page, loop: Loop) ->
 @pytest.mark.parametrize(
     ("text", "mode", "problem"),
     [
-        ("a" * 40, 0o640, "is readable by others"),
+        ("a" * 40, 0o640, "can be read by other users"),
         ("short", 0o600, "must contain a token"),
         ("", 0o600, "must contain a token"),
     ],

@@ -137,7 +137,7 @@ def test_a_forbidden_place_is_refused_in_one_line(folder: str) -> None:
         finally:
             os.seteuid(0)
     assert isinstance(answer.exception, InputError)
-    assert "cannot be written (Permission denied)" in str(answer.exception)
+    assert "cannot be written: Permission denied" in str(answer.exception)
 
 
 def test_images_of_a_sensor_that_has_none_are_not_claimed(tmp_path: Path) -> None:
