@@ -170,7 +170,7 @@ def whole_from_text(text: str, *, source: str | Path, field: str) -> int:
     """Parse a non-negative integer. Raises InputError for other text or too many digits."""
     # `isdigit` accepts a superscript two, and `int` other scripts' digits.
     if not (text.isascii() and text.isdigit()):
-        raise InputError(source, field, f"must be a whole number, not {shown(text)}")
+        raise InputError(source, field, f"must be a non-negative whole number, not {shown(text)}")
     if len(text) > DIGITS_MAX:
         raise InputError(source, field, f"must not have {len(text)} digits")
     return int(text)

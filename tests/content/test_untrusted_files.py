@@ -229,10 +229,10 @@ def ply(folder: Path, vertices: Any, faces: Any, form: str = "binary_little_endi
         (9, 10_000_000, "element face: 10,000,000 exceeds the limit of 2,000,000"),
         (10**18, 1, "exceeds the limit of 6,000,000"),
         (9, 1_999_999, "the file is truncated: the header declares 1,999,999 elements"),
-        ("²", 1, "element vertex: is not a whole number: ²"),
-        (9, "²", "element face: is not a whole number: ²"),
+        ("²", 1, "element vertex: must be a non-negative whole number, not ²"),
+        (9, "²", "element face: must be a non-negative whole number, not ²"),
         ("9" * 5000, 1, "element vertex: must not have 5000 digits"),
-        (9, "-4", "element face: is not a whole number: -4"),
+        (9, "-4", "element face: must be a non-negative whole number, not -4"),
     ],
 )
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
@@ -288,7 +288,7 @@ GLTFS: dict[str, tuple[dict[str, Any], str]] = {
     "a URI with NUL": (gltf(buffers=[{"byteLength": 48, "uri": "a%00b.bin"}]), "uri: the path contains a NUL"),
     "a long name": (
         gltf(buffers=[{"byteLength": 48, "uri": "a" * 300}]),
-        "uri: is not a valid path (File name too long)",
+        "uri: is not a valid path: File name too long",
     ),
     "an address": (
         gltf(buffers=[{"byteLength": 48, "uri": "http://localhost/a.bin"}]),
@@ -376,7 +376,7 @@ def test_json_that_nests_too_deep_is_refused(tmp_path: Path, suffix: str, text: 
     path, data = tmp_path / f"a{suffix}", text.encode()
     chunk = struct.pack("<I", len(data)) + b"JSON" + data
     path.write_bytes(data if suffix == ".gltf" else b"glTF" + struct.pack("<II", 2, 12 + len(chunk)) + chunk)
-    assert refused(path).endswith("the JSON is nested more than 64")
+    assert refused(path).endswith("the JSON is nested more than 64 levels deep")
 
 
 def test_json_of_too_many_values_is_refused_before_it_is_parsed(

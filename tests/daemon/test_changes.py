@@ -280,7 +280,7 @@ def test_a_command_that_fails_unexpectedly_is_refused_and_the_run_continues(
     answer = served.asked("place", {"scale": 2.0})
     assert answer == {"ok": False, "error": "unexpected error (OverflowError); see the log"}
     (line,) = (TextFormat(journald=False).format(record) for record in caplog.records if record.exc_info)
-    assert "place: unexpected error (OverflowError: int too large" in line and line.count("unexpected") == 1
+    assert "place: unexpected error: OverflowError: int too large" in line and line.count("unexpected") == 1
     assert all(account.presented for account in served.rig.refreshes(3))
     assert served.asked("pause")["paused"] is True
 

@@ -236,7 +236,7 @@ def test_without_opengl_automatic_is_the_processor_and_gl_is_refused() -> None:
     predictor = load_predictor("fast", STACK)
     choice = choose("auto", predictor, nothing)
     assert choice.backend.name == "cpu"
-    assert "no OpenGL" in choice.why
+    assert "OpenGL is not available" in choice.why
     with pytest.raises(MissingPart):
         choose("gl", predictor, nothing)
 
