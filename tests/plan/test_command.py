@@ -34,7 +34,7 @@ def test_it_says_what_is_left_out_with_time_and_error() -> None:
     ("eyes", "said"),
     [
         ("[-0.6, -0.03, 0], [-0.6, 0.03, 0]", "not in front of the panels"),
-        ("[0.061, 40, 0], [0.061, 40.06, 0]", "no part of the display is visible"),
+        ("[0.061, 40, 0], [0.061, 40.06, 0]", "cannot see any part of the display"),
     ],
 )
 def test_fixed_eyes_that_see_nothing_are_one_line(tmp_path: Path, eyes: str, said: str) -> None:
