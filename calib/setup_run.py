@@ -113,11 +113,12 @@ def summarise(setup: Setup, *, finished: bool) -> tuple[dict[str, Any], str]:
         lines.append(f"the configuration {setup.config} is valid; the figures are in {setup.out / 'setup.json'}")
         if setup.hardware.simulated:
             lines.append(
-                f"try it: phasestack run --config {setup.config} --replay demo --headless --frames 60 --out run"
+                f"to try the setup, run: phasestack run --config {setup.config} --replay demo --headless "
+                "--frames 60 --out run"
             )
         else:
-            lines.append(f"try it: phasestack run --config {setup.config}")
-            lines.append(f"check it: phasestack doctor --config {setup.config}")
+            lines.append(f"to try the setup, run: phasestack run --config {setup.config}")
+            lines.append(f"to check the setup, run: phasestack doctor --config {setup.config}")
     if missing:
         lines.append(f"steps not done: {', '.join(missing)}; run the same command again to continue")
     return summary, "\n".join(lines)

@@ -85,7 +85,7 @@ def calibration_text(
 ) -> str:
     """Return a solution as TOML for `runtime.eyes.calibration`; the report reads its `[data]`."""
     document = tomlkit.document()
-    document.add(tomlkit.comment("Made by `phasestack calibrate solve`. Lengths in metres, angles in radians."))
+    document.add(tomlkit.comment("Written by `phasestack calibrate solve`. Lengths are in metres, angles in radians."))
     document["stack_from_sensor"] = _rows(solution.similarity.matrix)
     document.update({
         "units": "m",
@@ -106,7 +106,9 @@ def calibration_text(
         "eye_error_m": float(solution.eye_error_m(volume_m).mean()),
     }
     covariance = tomlkit.table()
-    covariance.add(tomlkit.comment("of rotation vector, shift and log scale about the pivot, in the stack's axes"))
+    covariance.add(
+        tomlkit.comment("Covariance of the rotation vector, shift and log scale about the pivot, in the stack's axes.")
+    )
     covariance["pivot_m"] = solution.pivot_m.tolist()
     covariance["matrix"] = _rows(solution.covariance)
     document["covariance"] = covariance

@@ -124,7 +124,7 @@ class Result:
     @property
     def _line(self) -> str:
         line = f"model {self.model}, solved for a tracking error of {self.eye_sigma_mm:g} mm; "
-        return line + f"one ray a pixel, as published: {self._pair.quality.psnr_db:.1f} dB"
+        return line + f"PSNR with one ray per pixel, as published: {self._pair.quality.psnr_db:.1f} dB"
 
     def show(self) -> Path:
         """Open the solution's viewer in a browser. Returns the path of its file, which is not deleted."""
@@ -251,9 +251,9 @@ def evaluate(
     wanted = (pair.stack.count, pair.stack.height_px, pair.stack.width_px)
     if given.ndim != 4 or given.shape[:3] != wanted or given.shape[3] not in (3, 4):
         last = given.ndim == 4 and given.shape[1] in (3, 4) and given.shape[3] not in (3, 4)
-        advice = "; channels must come last: np.moveaxis(layers, 1, -1)" if last else ""
-        advice = "; for grey layers use np.stack([layers] * 3, -1)" if given.shape == wanted else advice
-        raise ValueError(f"layers: must have the shape {(*wanted, 3)} of the stack, not {given.shape}{advice}")
+        advice = "; channels must come last, so pass np.moveaxis(layers, 1, -1)" if last else ""
+        advice = "; for grey layers, pass np.stack([layers] * 3, -1)" if given.shape == wanted else advice
+        raise ValueError(f"layers: must have the shape {(*wanted, 3)}, not {given.shape}{advice}")
     if np.issubdtype(given.dtype, np.floating) and 1 < given.max() <= np.pi / 2:
         raise ValueError(
             f"layers: values must be at most 1, not {given.max():g}; if they are angles in radians, divide by pi/2"

@@ -37,10 +37,10 @@ def run(
     scale: Annotated[float, number(0.05, 2.0, help="factor applied to the size of offscreen panels in pixels")] = 1.0,
     backend: Annotated[
         str | None,
-        typer.Option(help="device for everything except the network: cpu, gl or auto (the faster)"),
+        typer.Option(help="device for everything except the network: cpu, gl or auto, which takes the faster"),
     ] = None,
     keep_light: Annotated[
-        int, typer.Option(min=0, help="write the layers to the --out folder every N refreshes (0: never)")
+        int, typer.Option(min=0, help="write the layers to the --out folder every N refreshes; 0 for never")
     ] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="print the summary as one JSON object")] = False,
 ) -> None:

@@ -44,7 +44,9 @@ def solve(
     ] = 1.0,
     backend: Annotated[
         str | None,
-        typer.Option(help="device for everything except the network: cpu, gl or auto (times both if --repeat >= 10)"),
+        typer.Option(
+            help="device for everything except the network: cpu, gl or auto, which times both if --repeat >= 10"
+        ),
     ] = None,
     no_plan: Annotated[
         bool, typer.Option("--no-plan", help="solve every pixel, even where the pictures make it unnecessary")

@@ -55,7 +55,7 @@ def _spz(path: Path) -> Gaussians:
     head = zipped.decompress(data, SPZ_SHORT) if zipped else data[: SPZ_HEADER.size]
     mark, version, count, degree, bits, _, _, table = SPZ_HEADER.unpack(head.ljust(SPZ_HEADER.size, b"\0"))
     if mark != b"NGSP" or not 1 <= version <= 4 or degree > 4:
-        raise InputError(path, "", "is not an SPZ file, or not of version 1 to 4")
+        raise InputError(path, "", "is not an SPZ file of version 1 to 4")
     untrusted_input.within(count, LIMITS.splats, source=path, field="splats")
     rest = (degree + 1) ** 2 - 1
     sizes = [count * each for each in (6 if version == 1 else 9, 1, 3, 3, 3 if version < 3 else 4, 3 * rest)]

@@ -272,7 +272,7 @@ def _problem(error: Exception) -> str:
     if isinstance(error, KeyError):
         return f"{untrusted_input.shown(str(error))} is missing"
     if isinstance(error, IndexError):
-        return "a reference to a missing object"
+        return "a reference points to a missing object"
     own = isinstance(error, ValueError) and error.args and str(error.args[0]).startswith(OWN_PROBLEMS)
     return one_line(str(error), most=120) if own else "a value has the wrong type"
 
@@ -309,7 +309,7 @@ def _faces(corners: Array, mode: int) -> Array:
         return corners[np.column_stack([number, number + 1 + number % 2, number + 2 - number % 2])]
     if mode == FAN:
         return corners[np.column_stack([number + 1, number + 2, np.zeros_like(number)])]
-    raise ValueError(f"a primitive's mode is {mode}")
+    raise ValueError(f"a primitive has the unsupported mode {mode}")
 
 
 def _coordinates(use: Table) -> tuple[int, Table]:

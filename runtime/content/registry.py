@@ -43,7 +43,7 @@ OTHER_FILES = {  # by suffix: kind of file, and the way out
     ),
     **dict.fromkeys((".xyz", ".pts", ".pcd", ".las", ".laz", ".e57"), ("a point cloud", TO_PLY)),
     **dict.fromkeys(FILMS, ("a film", "convert it with `ffmpeg -i in{} out.mp4`")),
-    **dict.fromkeys((".ksplat", ".lcc"), ("compressed splats", TO_SPLATS)),
+    **dict.fromkeys((".ksplat", ".lcc"), ("a compressed splat file", TO_SPLATS)),
 }
 LFS = b"version https://git-lfs"
 TRIED_PX = (32, 18)  # size of the trial picture of a user-defined scene

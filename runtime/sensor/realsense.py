@@ -175,7 +175,7 @@ def _rgb(frame: Any) -> U8:
     """Copy a colour frame as (h, w, 3) RGB. Raises SensorLost if its format is not in `COLOURS`."""
     kind = frame.profile.format().name
     if kind not in COLOURS:
-        raise SensorLost(f"RealSense: colour format {kind} is not supported ({', '.join(COLOURS)})")
+        raise SensorLost(f"RealSense: colour format {kind} is not supported; supported formats: {', '.join(COLOURS)}")
     return np.ascontiguousarray(np.asanyarray(frame.get_data())[..., COLOURS[kind]])
 
 

@@ -236,7 +236,7 @@ def depth_from_message(data: bytes) -> U16:
     raw = base64.b64decode(image.data)
     if len(raw) != 2 * image.width * image.height:
         raise ValueError(
-            f"a depth image has {len(raw)} bytes, not those of {image.width} x {image.height} 16-bit pixels"
+            f"a depth image has {len(raw)} bytes, but {image.width} x {image.height} pixels need two bytes each"
         )
     return np.frombuffer(raw, "<u2").reshape(image.height, image.width).astype(np.uint16)
 

@@ -37,8 +37,8 @@ def test_json_gives_the_same_as_csv(tmp_path: Path, wrapped: bool) -> None:
 @pytest.mark.parametrize(
     ("name", "text", "wanted"),
     [
-        ("p.csv", "", "sensor_x: column is missing"),
-        ("p.csv", "a,b\n1,2\n", "sensor_x: column is missing"),
+        ("p.csv", "", "sensor_x: the column is missing"),
+        ("p.csv", "a,b\n1,2\n", "sensor_x: the column is missing"),
         ("p.csv", HEADER + "\n1,2,3,4,5\n", "line 2, stack_z: is missing"),
         ("p.csv", HEADER + "\n1,2,3,4,5,6\n1,nan,3,4,5,6\n", "line 3, sensor_y: is not finite"),
         ("p.csv", HEADER + "\n1,2,3,4,5,1e999\n", "line 2, stack_z: is not finite"),
@@ -47,7 +47,7 @@ def test_json_gives_the_same_as_csv(tmp_path: Path, wrapped: bool) -> None:
         ("p.json", "{", "malformed"),
         ("p.json", "3", "must be a list"),
         ("p.json", "[1]", "must be a list of objects"),
-        ("p.json", '[{"sensor_x": 1}]', "sensor_y: column is missing"),
+        ("p.json", '[{"sensor_x": 1}]', "sensor_y: the column is missing"),
         (
             "p.csv",
             HEADER + "\n,2,x,4,5,6\n1,2,3,4,5,nan\n1,2,3,4,5,inf\n",

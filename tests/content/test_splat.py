@@ -265,7 +265,7 @@ def test_a_compressed_file_stands_by_its_format_s_custom(tmp_path: Path, stack: 
             lambda data: b"NGSP\4\0\0\0\1\0\0\0\0\x0c\0\5\0\0\0\1" + bytes(12),
             "is damaged or is not an SPZ file",
         ),
-        ("a.spz", lambda data: gzip.compress(b"NGSP" + bytes(40)), "is not an SPZ file, or not of version 1 to 4"),
+        ("a.spz", lambda data: gzip.compress(b"NGSP" + bytes(40)), "is not an SPZ file of version 1 to 4"),
         ("a.sog", lambda data: data[:400], "is damaged or is not a SOG file"),
         ("a.sog", lambda data: data.replace(b'"version": 2', b'"version": 3'), "is damaged or is not a SOG file"),
         (

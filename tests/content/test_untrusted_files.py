@@ -324,7 +324,7 @@ GLTFS: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "a corner that is not there": (
         gltf(accessors=[{"componentType": 5126, "count": 1, "type": "VEC3"}, *gltf()["accessors"][1:]]),
-        "is damaged or is not glTF: a reference to a missing object",
+        "is damaged or is not glTF: a reference points to a missing object",
     ),
     "a number as a list": (gltf(nodes=7), "is damaged or is not glTF: a value has the wrong type"),
     "an older table": (
@@ -358,7 +358,7 @@ def test_a_gltf_is_refused_by_what_it_says_of_itself(tmp_path: Path, name: str) 
         ("a.xyz", "is a point cloud (.xyz), which is not supported; save it as PLY"),
         (
             "a.LCC",
-            "is compressed splats (.lcc), which is not supported; convert it with `npx @playcanvas/splat-transform",
+            "is a compressed splat file (.lcc), which is not supported; convert it with `npx @playcanvas",
         ),
         ("a.wmv", "is a film (.wmv), which is not supported; convert it with `ffmpeg -i in.wmv out.mp4`"),
         ("a.glb", "is a Git LFS pointer; fetch the file itself with `git lfs pull`"),
