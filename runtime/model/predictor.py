@@ -80,7 +80,7 @@ def load_predictor(name: str, stack: PanelStack, settings: ModelSettings | None 
     session = ModelSession(path, provider=settings.provider, threads=settings.threads, sha256=shipped_sha256(name))
     contract = session.contract
     if name in SHIPPED and not (stack.count == 3 and stack.is_evenly_spaced):
-        title = f"{name} (without its network, which requires three evenly spaced panels)"
+        title = f"{name} (without its network: needs three even panels)"
         return StepPredictor(stack, None, steps_from_even(len(contract.steps)), name=title, threads=settings.threads)
     if contract.panels != stack.count:
         raise InputError(
