@@ -293,7 +293,7 @@ def _rate(predictor: Predictor, backend: SolverBackend, settings: Settings) -> R
     detail = f"{raster}: {took_ms:.0f} ms per full solution, or {1000 / took_ms:.1f} per second ({how})"
     if took_ms < SLOW_MS:
         return Row("rate", "ok", detail)
-    coarser = "moving viewers will see coarser pictures: " if settings.model.effort == "auto" else ""
+    coarser = "moving viewers will see coarser pictures; " if settings.model.effort == "auto" else ""
     sharper = "use a GPU, the model `fast` or panels with fewer pixels (see docs/planning.md)"
     return Row("rate", "warn", detail, coarser + sharper)
 
