@@ -71,14 +71,20 @@ class Mark:
 def marks(stack: PanelStack) -> tuple[Mark, ...]:
     """Lay out every panel's marks. Raises InputError if the panels are too small or there are too many."""
     if stack.count * PER_PANEL > DICTIONARY_SIZE:
-        raise InputError("stack", "x_m", f"calibration boards support at most {DICTIONARY_SIZE // PER_PANEL} panels")
+        raise InputError(
+            "stack",
+            "x_m",
+            f"has more panels than the calibration boards support; the maximum is {DICTIONARY_SIZE // PER_PANEL}",
+        )
     unit = max(2, round(min(stack.width_px * 9 / 16, stack.height_px) / BITS_ON_SHORT_SIDE))
     tile = TILE * unit
     cell = np.array([stack.width_px / ACROSS, stack.height_px / DOWN])
     room = cell - tile - 2
     if room.min() < 0:
         raise InputError(
-            "stack", "width_px", f"must be larger; boards need panels of {ACROSS * tile}x{DOWN * tile} pixels"
+            "stack",
+            "width_px",
+            f"is too small; the boards need panels of at least {ACROSS * tile}x{DOWN * tile} pixels",
         )
     every = []
     random = np.random.default_rng(16)  # fixed seed, so that photographs match the board

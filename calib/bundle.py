@@ -247,7 +247,7 @@ def _refuse_reverse(problem: _Problem, state: _State) -> None:
         other = _solved(problem, problem.start(reverse=True), everything, robust=True)
         behind = _median_px(problem, other) < NO_FIT_PX
     if behind:
-        raise Undetermined("the panels are in the reverse of the configured order; panel 0 must be the one at the rear")
+        raise Undetermined("the panels are in reverse order; panel 0 must be the rear panel")
 
 
 def _median_px(problem: _Problem, state: _State) -> float:
@@ -282,8 +282,8 @@ def adjust(seen: Sequence[SeenMarks], stack: PanelStack, *, reference: int) -> B
     freedom = 2 * int(used.sum()) - problem.size
     if freedom <= 0:
         raise Undetermined(
-            f"the photographs have only {int(used.sum())} consistent points for {problem.size} "
-            "unknowns; take more of them"
+            f"the photographs contain only {int(used.sum())} consistent points for {problem.size} "
+            "unknowns; take more photographs"
         )
     residual = problem.residual_px(state)
     sigma = float(np.sqrt((residual[used] ** 2).sum() / freedom))
@@ -309,6 +309,6 @@ def _covariance(problem: _Problem, state: _State, used: NDArray[np.bool_], *, si
     lengths = np.linalg.norm(weighted, axis=0)
     values, axes = np.linalg.svd(np.linalg.qr(weighted / lengths, mode="r"))[1:]
     if values[-1] < 1e-9 * values[0]:
-        raise Undetermined("the photographs do not determine all unknowns; take them from more directions")
+        raise Undetermined("the photographs do not determine all unknowns; take photographs from more directions")
     root = (axes.T / values) / lengths[:, None]
     return np.asarray(root @ root.T)

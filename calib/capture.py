@@ -108,7 +108,7 @@ class Walk:
     def begin(self) -> None:
         """Announce the first viewpoint."""
         if self.finished:
-            self._say("all viewpoints already have a pair")
+            self._say("every viewpoint already has a pair")
         else:
             self._announce()
 
@@ -151,7 +151,7 @@ class Walk:
         middle_m, spread_m = seen
         spread = f"{spread_m * 1e3:.1f}"
         if spread_m > MAX_SPREAD_M:
-            self._say(f"{viewpoint.name}: rejected because the eyes moved or scattered by {spread} mm; hold still")
+            self._say(f"{viewpoint.name}: rejected because the eye positions scattered by {spread} mm; hold still")
             return
         self._file.accept(
             PairRow.of(middle_m, viewpoint.midpoint_m, viewpoint.name, serial=self._serial, spread_mm=spread)
@@ -178,7 +178,7 @@ class Walk:
         self._say(
             f"{viewpoint.name} ({self._index + 1} of {len(self._left)}): {x * 100:.0f} cm in front of the display, "
             f"{abs(y) * 100:.0f} cm to its {'right' if y > 0 else 'left'}, {z * 100:.0f} cm up; "
-            f"Enter: fused, n: next, p: previous, q: stop"
+            f"press Enter when the lines fuse, n for the next viewpoint, p for the previous viewpoint, or q to stop"
         )
 
 
@@ -246,7 +246,7 @@ def capture_recording(out: Path, settings: Settings, *, source: str) -> dict[str
                 name = f"at {frame.capture_ns / NS_PER_S:.3f} s"
                 pairs.append(PairRow.of(middle, frame.true_eyes_m.mean(axis=0), name, serial=samples.serial))
     if not pairs:
-        problem = "the sample has no usable eyes" if known else "the recording has no true eye positions"
+        problem = "the sample contains no usable eyes" if known else "the recording contains no true eye positions"
         raise InputError(source, "", f"{problem}; capture from the live sensor instead")
     file.accept(*pairs)
     return {"file": str(out), "pairs": len(file), "accepted": len(pairs)}

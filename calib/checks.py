@@ -35,8 +35,8 @@ def check_pairs(pairs: Pairs) -> list[str]:
         raise InputError(
             pairs.source,
             "pairs",
-            "sensor and stack are mirror images (determinant negative): an axis points the wrong way; "
-            "sensor is x right, y down, z away from the camera, stack is x to the viewer, y right, z up",
+            "the sensor and stack frames are mirror images (negative determinant), so one axis points the wrong way; "
+            "the sensor's must point right, down and away from the camera, the stack's to the viewer, right and up",
         )
     try:
         scale = float(fit(pairs.sensor_m, pairs.stack_m, rule="inverse").scale)
@@ -44,12 +44,12 @@ def check_pairs(pairs: Pairs) -> list[str]:
         raise InputError(pairs.source, "pairs", str(error)) from None
     for wrong, side in ((1e-3, "sensor"), (1e3, "stack")):
         if 0.8 < scale / wrong < 1.25:
-            problem = f"must be in metres, but {side} seems to be in millimetres (scale {scale:.4g})"
+            problem = f"must be in metres, but {side} appears to be in millimetres (the scale is {scale:.4g})"
             raise InputError(pairs.source, f"{side}_x", problem)
     first, _, third = extents(pairs.stack_m)
     if third > COPLANAR * first:
         return []
-    return ["all viewpoints are in one plane, which suffices for the rotation but hides mirrored axes"]
+    return ["all viewpoints are in one plane, so mirrored axes cannot be detected; add a viewpoint outside the plane"]
 
 
 def check_solution(pairs: Pairs, solution: CalibrationSolution, volume_m: F64) -> list[str]:
@@ -71,8 +71,8 @@ def check_solution(pairs: Pairs, solution: CalibrationSolution, volume_m: F64) -
         raise InputError(
             pairs.source,
             "pairs",
-            f"do not fit: RMS residual along {axis} is {solution.axis_rms_m.max() * 1e3:.0f} mm, "
-            f"more than {RESIDUAL_LIMIT_M * 1e3:.0f} mm{hint}",
+            f"do not fit: the RMS residual along {axis} is {solution.axis_rms_m.max() * 1e3:.0f} mm, "
+            f"but the limit is {RESIDUAL_LIMIT_M * 1e3:.0f} mm{hint}",
         )
     noise_m = max(solution.noise_m, SENSOR_NOISE_FLOOR_M)
     error_m = float(solution.eye_error_m(volume_m, noise_m=noise_m).mean())
@@ -80,24 +80,24 @@ def check_solution(pairs: Pairs, solution: CalibrationSolution, volume_m: F64) -
         raise InputError(
             pairs.source,
             "pairs",
-            f"do not determine the calibration: with {noise_m * 1e3:.1f} mm of noise the eyes would be off by "
-            f"{error_m * 1e3:.0f} mm on average (condition {solution.condition:.3g}): "
-            "the viewpoints are too few, too close together or nearly on one line",
+            f"do not determine the calibration: {noise_m * 1e3:.1f} mm of noise would shift the eyes by "
+            f"{error_m * 1e3:.0f} mm on average (condition number {solution.condition:.3g}); "
+            "add viewpoints that are farther apart and not on one line",
         )
     if error_m > WARN_EYE_ERROR_M:
         warnings.append(
-            f"expect {error_m * 1e3:.0f} mm of error at the eye (condition {solution.condition:.3g}): "
-            "use more viewpoints, farther apart"
+            f"the expected error at the eye is {error_m * 1e3:.0f} mm (condition number {solution.condition:.3g}); "
+            "add viewpoints that are farther apart"
         )
     rejected = np.flatnonzero(~solution.used).tolist()
     if rejected:
         warnings.append(f"{_listed(pairs, rejected)}: rejected as outliers")
     beyond = np.flatnonzero(solution.used & (np.abs(solution.residual_m).max(-1) > RESIDUAL_LIMIT_M)).tolist()
     if beyond:
-        warnings.append(f"{_listed(pairs, beyond)}: residual beyond {RESIDUAL_LIMIT_M * 1e3:.0f} mm")
+        warnings.append(f"{_listed(pairs, beyond)}: the residual exceeds {RESIDUAL_LIMIT_M * 1e3:.0f} mm")
     scale = float(solution.similarity.scale)
     if not 0.8 <= scale <= 1.25:
-        warnings.append(f"the scale is {scale:.5g}: the runtime expects metres in both frames")
+        warnings.append(f"the scale is {scale:.5g}, but it must be about 1; check that both frames are in metres")
     return warnings
 
 

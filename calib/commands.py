@@ -44,7 +44,7 @@ def panels(
     Example: phasestack calibrate panels --photos photos --config phasestack.toml --write --out registration
     """
     if show == (photos is not None) or (photos is not None and out is None):
-        raise InputError("calibrate panels", "--show", "give either --show, or --photos with --out")
+        raise InputError("calibrate panels", "--show", "pass either --show, or both --photos and --out")
     if write and (config is None or photos is None):
         raise InputError("calibrate panels", "--write", "requires --config and --photos")
     settings = _settings(config)
@@ -65,7 +65,7 @@ def panels(
 @app.command()
 def grey(
     out: Annotated[Path | None, typer.Option(help="CSV file to write the LUT to")] = None,
-    panel: Annotated[int, typer.Option(help="index of the panel; 0 is the one at the rear", min=0)] = 0,
+    panel: Annotated[int, typer.Option(help="index of the panel; 0 is the rear panel", min=0)] = 0,
     photos: Annotated[Path | None, typer.Option(help="folder with two or three photographs of the chart")] = None,
     show: Annotated[bool, typer.Option("--show", help="show the chart on the panel until Enter or q")] = False,
     config: ConfigOption = None,
@@ -80,11 +80,11 @@ def grey(
     Example: phasestack calibrate grey --panel 2 --photos photos --out panel-2.csv
     """
     if show == (photos is not None) or (photos is not None and out is None):
-        raise InputError("calibrate grey", "--show", "give either --show, or --photos with --out")
+        raise InputError("calibrate grey", "--show", "pass either --show, or both --photos and --out")
     settings = _settings(config)
     stack = settings.stack.stack()
     if panel >= stack.count:
-        raise InputError("calibrate grey", "--panel", f"must be 0 to {stack.count - 1}")
+        raise InputError("calibrate grey", "--panel", f"must be from 0 to {stack.count - 1}")
     if photos is not None and out is not None:
         from calib.grey_chart import lut_from_photographs
         from calib.photographs import photographs
@@ -117,10 +117,10 @@ def charts(
 
 @app.command()
 def capture(
-    out: Annotated[Path, typer.Option(help="CSV file for the pairs; capture continues an existing one")],
+    out: Annotated[Path, typer.Option(help="CSV file for the pairs; capture adds to an existing file")],
     config: ConfigOption = None,
     replay: Annotated[
-        str | None, typer.Option(help="recording to use instead of the sensor; `demo` is built in")
+        str | None, typer.Option(help="recording to use instead of the sensor; `demo` uses the built-in recording")
     ] = None,
     show: Annotated[bool, typer.Option("--show", help="show the charts on the panels")] = False,
     as_json: JsonOption = False,
@@ -153,11 +153,14 @@ def capture(
 @app.command()
 def solve(
     pairs: Annotated[Path, typer.Option(help="CSV or JSON file of point pairs (sensor_x, stack_x, ...) in metres")],
-    out: Annotated[Path, typer.Option(help="calibration file to write (TOML); the version that it replaces is kept")],
+    out: Annotated[Path, typer.Option(help="calibration file to write (TOML); an existing file is backed up")],
     method: Annotated[
-        str, typer.Option(help="seed, least-squares, inverse, robust or fixed-scale; default: the best for these pairs")
+        str,
+        typer.Option(
+            help="seed, least-squares, inverse, robust or fixed-scale (default: the best method for these pairs)"
+        ),
     ] = "",
-    scale: Annotated[float, number(*SCALE, help="known scale (only for the method fixed-scale)")] = 1.0,
+    scale: Annotated[float, number(*SCALE, help="known scale, for the method fixed-scale")] = 1.0,
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:

@@ -110,8 +110,8 @@ def _mirrored(picture: U8, known: dict[int, Mark], counts: list[int]) -> str:
     for panel, count in enumerate(counts):
         if count < MIN_MARKS <= turned.count(panel):
             if max(counts) < MIN_MARKS:
-                return "is mirrored, either by a selfie camera or because `mirror` is wrong for all panels"
-            return f"shows panel {panel} mirrored, so its `mirror` in the configuration is wrong"
+                return "is mirrored; use a camera that does not mirror, or correct `mirror` in the configuration"
+            return f"shows panel {panel} mirrored; correct its `mirror` in the configuration"
     return ""
 
 
@@ -124,12 +124,12 @@ def _unreadable(counts: list[int], edges: list[float], unit_px: float) -> str:
         unit_px: Size of a marker bit in the photograph.
     """
     if sum(counts) == 0:
-        return "shows no mark of a board; it may be blurred, too dark or of something else"
+        return "shows no marks of a board; check that it shows the display and is neither blurred nor too dark"
     edge_bits = float(np.median(edges))
     if edge_bits > BLURRED_BITS:
-        return f"is blurred; its edges are {edge_bits * unit_px:.1f} px wide"
+        return f"is blurred, with edges {edge_bits * unit_px:.1f} px wide; take a sharper photograph"
     if unit_px < MIN_UNIT_PX:
-        return f"shows marks that are too small ({unit_px:.1f} px per bit); go nearer or use a higher resolution"
+        return f"shows marks that are too small ({unit_px:.1f} px per bit); move closer or use a higher resolution"
     return ""
 
 
@@ -147,11 +147,11 @@ def _covered(counts: list[int], places: F64, owners: Any) -> str:
     fewest = min(counts)
     if fewest < MIN_MARKS:
         panel = counts.index(fewest)
-        return f"shows {fewest} marks of panel {panel}, fewer than {MIN_MARKS}; it is covered, cut off or too oblique"
+        return f"shows {fewest} marks of panel {panel}, but at least {MIN_MARKS} are needed; show the whole panel"
     for panel in range(len(counts)):
         share = float(np.ptp(places[owners == panel], axis=0).min())
         if share < MIN_EXTENT:
-            return f"shows only {100 * share:.0f}% of the width or height of panel {panel}, which is covered or cut off"
+            return f"shows only {100 * share:.0f}% of the width or height of panel {panel}; show the whole panel"
     return ""
 
 

@@ -78,7 +78,7 @@ def show_until_key(display: PanelDisplay, layers: U8, title: str) -> None:
     keys, clock = TerminalKeys(), MonotonicClock()
     try:
         display.show(layers)
-        typer.echo(f"{title}  (Enter or q: done)", err=True)
+        typer.echo(f"{title} (press Enter or q when done)", err=True)
         while (keys.poll() or display.key()) not in (Key.ACCEPT, Key.QUIT):
             clock.sleep_until_ns(clock.now_ns() + POLL_NS)
     finally:

@@ -162,8 +162,7 @@ def histograms(picture: U8, stack: PanelStack, panel: int, *, source: str) -> F6
     mine, marks_seen = seen.panel == panel, seen.marks[panel]
     if marks_seen < MIN_MARKS:
         problem = (
-            f"shows {marks_seen} marks of panel {panel}; it may be blurred, cut off, too small or of "
-            "another panel's chart"
+            f"shows only {marks_seen} marks of panel {panel}; check that it is sharp and shows this panel's whole chart"
         )
         raise InputError(source, "", problem)
     image_from_panel, _ = cv2.findHomography(seen.panel_px[mine], seen.image_px[mine], cv2.RANSAC, 8.0)
@@ -174,7 +173,7 @@ def histograms(picture: U8, stack: PanelStack, panel: int, *, source: str) -> F6
         places = cv2.perspectiveTransform(np.stack([u, v], axis=-1).reshape(1, -1, 2), image_from_panel)[0]
         column, row = np.rint(places).astype(int).T
         if min(column.min(), row.min()) < 0 or column.max() >= picture.shape[1] or row.max() >= picture.shape[0]:
-            raise InputError(source, "", "does not show the whole chart")
+            raise InputError(source, "", "does not show the whole chart; move back")
         rows.append(np.bincount(picture[row, column], minlength=256) / len(row))
     counts = np.array(rows)
     white = np.array([patch.grey == 255 for patch in patches(stack, panel)])
@@ -237,7 +236,7 @@ def measure(pictures: list[F64], stack: PanelStack, panel: int, *, source: str) 
     falls = np.flatnonzero(np.diff(levels) < -FALLS)
     if falls.size:
         lower, upper = GREYS[int(falls[0])], GREYS[int(falls[0]) + 1]
-        problem = f"grey {upper} is darker than grey {lower}, so this is not a grey curve"
-        causes = "possible causes are a reflection, a change of exposure or a wrong LUT"
-        raise InputError(source, "greys", f"{problem} ({causes})")
+        problem = f"grey {upper} is darker than grey {lower}"
+        causes = "check for a reflection, a change of exposure and a wrong LUT"
+        raise InputError(source, "greys", f"{problem}; {causes}")
     return np.clip(levels, 0.0, 1.0), float(np.median(np.abs(fit.fun)))

@@ -118,10 +118,12 @@ class SetupHardware:
         self._display = open_display(settings, grey_curve=panel is None)
         try:
             self._display.show(grey_layers(pictures))
-            say(f"put {count} into {folder}, then press Enter (q: stop)")
+            say(f"put {count} into {folder}, then press Enter, or q to stop")
             while (key := self.key()) is not Key.ACCEPT:
                 if key is Key.QUIT:
-                    raise InputError("photographs", "", "no photographs were taken")
+                    raise InputError(
+                        "photographs", "", "no photographs were taken; put them into the folder before pressing Enter"
+                    )
         finally:
             self.let_go()
         return photographs(folder)
@@ -148,13 +150,13 @@ class SetupHardware:
             if worker.error is not None:
                 raise worker.error
             if self._clock.now_ns() > until_ns:
-                reason = worker.reason or "does not answer"
+                reason = worker.reason or "the sensor does not answer"
                 self._stop_sensor()
                 raise InputError("sensor", "driver", f"{settings.sensor.driver}: {reason}")
             self.wait()
         if worker.capabilities.in_stack_frame:
             self._stop_sensor()
-            raise InputError("sensor", "driver", "delivers eyes in the stack frame, so there is nothing to calibrate")
+            raise InputError("sensor", "driver", "delivers eyes in the stack frame and needs no calibration")
         return f"{settings.sensor.driver} {worker.serial}".strip()
 
     def sample(self, standing_at: Viewpoint) -> Sample | None:

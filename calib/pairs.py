@@ -34,7 +34,7 @@ def _bounded(value: float) -> float:
     if not math.isfinite(value):
         raise ValueError("is not finite")
     if abs(value) > MAX_MAGNITUDE:
-        raise ValueError(f"is beyond {MAX_MAGNITUDE:g}")
+        raise ValueError(f"exceeds {MAX_MAGNITUDE:g}")
     return value
 
 
@@ -97,7 +97,9 @@ def read_pairs(path: Path) -> Pairs:
         raise InputError(path, "", f"contains {len(rows)} pairs, but the maximum is {MAX_PAIRS}")
     serials = {row.sensor_serial for row in rows} - {""}
     if len(serials) > 1:
-        raise InputError(path, "sensor_serial", f"contains pairs of different sensors: {', '.join(sorted(serials))}")
+        raise InputError(
+            path, "sensor_serial", f"names different sensors ({', '.join(sorted(serials))}); use pairs from one sensor"
+        )
     names = tuple(
         f"{label} ({row.viewpoint})" if row.viewpoint else label for label, row in zip(labels, rows, strict=True)
     )
@@ -130,7 +132,7 @@ def _read_rows(path: Path) -> tuple[list[str], list[PairRow]]:
         labels, items = [label for label, _ in read], [row for _, row in read]
     missing = [name for name in COLUMNS if name not in columns]
     if missing:
-        raise InputError(path, missing[0], "column is missing (required: " + ", ".join(COLUMNS) + ")")
+        raise InputError(path, missing[0], "the column is missing; required columns: " + ", ".join(COLUMNS))
     try:
         return labels, TypeAdapter(list[PairRow]).validate_python(items)
     except ValidationError as error:
@@ -183,7 +185,7 @@ class PairsFile:
         serial, replaced = pairs[0].sensor_serial, {pair.viewpoint for pair in pairs} - {""}
         others = {row.sensor_serial for row in self.rows} - {"", serial}
         if others and serial:
-            problem = f"the file has pairs of sensor {min(others)}, but this pair is from {serial}"
+            problem = f"the file contains pairs from sensor {min(others)}, but this pair is from sensor {serial}"
             raise InputError(self.path, "sensor_serial", problem)
         self.rows = [row for row in self.rows if row.viewpoint not in replaced] + list(pairs)
         self._write()

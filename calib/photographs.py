@@ -26,7 +26,7 @@ def photographs(folder: Path) -> Iterator[tuple[str, U8]]:
         raise InputError(folder, "", "is not a folder")
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
     if not paths:
-        raise InputError(folder, "", "contains no photographs (" + ", ".join(sorted(SUFFIXES)) + ")")
+        raise InputError(folder, "", "contains no photographs; use " + ", ".join(sorted(SUFFIXES)))
     if len(paths) > MAX_PHOTOGRAPHS:
         raise InputError(folder, "", f"contains {len(paths)} pictures, but the maximum is {MAX_PHOTOGRAPHS}")
     for path in paths:
@@ -42,5 +42,5 @@ def read_photograph(path: Path) -> U8:
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
     picture = None if is_cut_off(data) else cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     if picture is None:
-        raise InputError(path, "", "cannot be decoded; use JPEG or PNG (export HEIC as JPEG)")
+        raise InputError(path, "", "cannot be decoded; use JPEG or PNG, and export HEIC as JPEG")
     return np.asarray(picture)

@@ -81,7 +81,7 @@ def geometry_of(panels: Sequence[PlacedPanel], stack: PanelStack, *, eye_m: F64)
     """
     x_m = tuple(panel.axis_x_m for panel in panels)
     if any(b <= a for a, b in pairwise(x_m)):
-        raise Undetermined("the panels are not in the configuration's order from rear to front")
+        raise Undetermined("the panels are not in the order of the configuration, from rear to front")
     depth = tuple((0.0, float(right), float(up)) for right, up in (panel.slope + 0.0 for panel in panels))
     x, y, z = (float(value) for value in eye_m)
     return replace(stack, x_m=x_m, tilt=Tilt(depth, (x, y, z)))
@@ -112,11 +112,11 @@ def register_photographs(seen: Sequence[SeenMarks], stack: PanelStack, *, eye_m:
         if max(unfit) <= DISAGREES:
             break
         odd = good.pop(int(np.argmax(unfit)))
-        excluded[odd.name] = "does not agree with the other photographs; it shows another stack, or something has moved"
+        excluded[odd.name] = "contradicts the other photographs, because it shows another stack or something has moved"
     _refuse_one_place(bundle)
     if bundle.sigma_px > MISFIT_PX:
         raise Undetermined(
-            f"the photographs do not show one rigid stack; points are off by {bundle.sigma_px:.1f} px on average"
+            f"the photographs do not show one rigid stack: points are off by {bundle.sigma_px:.1f} px on average"
         )
     model = geometry_of(bundle.panels, stack, eye_m=eye_m)
     _refuse_implausible(bundle, stack)
@@ -130,7 +130,7 @@ def register_photographs(seen: Sequence[SeenMarks], stack: PanelStack, *, eye_m:
     worst_px = float(np.linalg.norm(corner_sigma_px, axis=-1).max())
     if worst_px > DOUBTFUL_PX:
         raise Undetermined(
-            f"the photographs leave a corner of a panel uncertain by {worst_px:.2f} px; take more, from more directions"
+            f"the photographs leave a panel's corner uncertain by {worst_px:.2f} px; take more from other directions"
         )
     return Registration(
         bundle=bundle,
@@ -148,7 +148,7 @@ def register_photographs(seen: Sequence[SeenMarks], stack: PanelStack, *, eye_m:
 def _other_sizes(good: Sequence[SeenMarks]) -> dict[str, str]:
     sizes = [(s.width_px, s.height_px) for s in good]
     width, height = max(sizes, key=sizes.count, default=(0, 0))
-    text = f"differs in size from the others ({width}x{height}); use one camera with one setting"
+    text = f"differs in size from the other photographs ({width}x{height}); use one camera and one setting"
     return {s.name: text for s, size in zip(good, sizes, strict=True) if size != (width, height)}
 
 
@@ -156,7 +156,7 @@ def _refuse_few(good: int, count: int, excluded: dict[str, str]) -> None:
     if good < MIN_PHOTOGRAPHS:
         reasons = "; ".join(f"{name} {fault}" for name, fault in excluded.items())
         raise Undetermined(
-            f"{good} of {count} photographs are usable; at least {MIN_PHOTOGRAPHS} are needed"
+            f"only {good} of {count} photographs are usable, but at least {MIN_PHOTOGRAPHS} are needed"
             + (f": {reasons}" if reasons else "")
         )
 
@@ -167,8 +167,8 @@ def _refuse_one_place(bundle: Bundle) -> None:
     span = float(np.degrees(np.arccos(np.clip((directions @ directions.T).min(), -1, 1))))
     if span < MIN_SPAN_DEG:
         raise Undetermined(
-            f"the photographs are all from one position (their directions span {span:.0f} degrees, at least "
-            f"{MIN_SPAN_DEG:.0f} are needed): take some from the left and the right, from above and below"
+            f"the photographs' directions span only {span:.0f} degrees, but at least {MIN_SPAN_DEG:.0f} are needed; "
+            "take photographs from the left, from the right, from above and from below"
         )
 
 
@@ -179,13 +179,13 @@ def _refuse_implausible(bundle: Bundle, stack: PanelStack) -> None:
             origin_m = stack.x_m[bundle.reference]
             raise Undetermined(
                 f"panel {index} is {abs(panel.axis_x_m - origin_m) * 1e3:.1f} mm from panel {bundle.reference}, but "
-                f"{abs(stack.x_m[index] - origin_m) * 1e3:.1f} mm in the configuration: the photographs are of another "
-                "stack, or stack.x_m, width_m and height_m are wrong"
+                f"{abs(stack.x_m[index] - origin_m) * 1e3:.1f} mm in the configuration; check that the photographs "
+                "are of this stack and that stack.x_m, width_m and height_m are correct"
             )
         if np.abs(off[1:]).max() > IMPLAUSIBLE_M:
             raise Undetermined(
-                f"panel {index} is shifted {np.linalg.norm(off[1:]) * 1e3:.0f} mm from panel {bundle.reference}: "
-                "the photographs are of another stack, or the panel must be moved by hand first"
+                f"panel {index} is shifted by {np.linalg.norm(off[1:]) * 1e3:.0f} mm from panel {bundle.reference}; "
+                "check that the photographs are of this stack, or move the panel into place by hand"
             )
 
 
@@ -261,8 +261,8 @@ def registration_summary(registered: Registration) -> dict[str, Any]:
     notes = list(registered.notes)
     if not stack.is_evenly_spaced:
         notes.append(
-            f"the gaps differ by more than {100 * UNEVEN_MOST:.0f}%, which the networks do not "
-            "support; use the model sart"
+            f"the gaps differ by more than {100 * UNEVEN_MOST:.0f}%, and the networks do not "
+            "support that; use the model sart"
         )
     return {
         "reference": bundle.reference,

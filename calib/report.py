@@ -67,7 +67,7 @@ def write_report(file: Path, out: Path, *, viewing: CalibrationSettings) -> dict
     if isinstance(table.get("warnings"), list):
         notes += [str(text) for text in table["warnings"]]
     if points is None:
-        notes.append("This file contains no pairs (or too many), so the error of each point is unknown.")
+        notes.append("This file contains no pairs, or too many, so the error of each point is unknown.")
     else:
         text = "X, Y and Z error of every calibration point (the EyeReal supplement's figure S5)"
         figure = Figure("residuals", residual_figure(points, limit_m=RESIDUAL_LIMIT_M), text)

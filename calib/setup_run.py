@@ -93,12 +93,12 @@ def walk_through(setup: Setup) -> bool:
         state = "already done" if step.name in setup.done else "not done yet"
         setup.say(f"\nStep {number + 1} of {len(STEPS)}: {step.title}\n{step.what}\n({state})")
         try:
-            answer = setup.ask("Enter: start, n: skip (keeps earlier results), p: previous step", "do it")
+            answer = setup.ask("Enter: start this step, n: skip it and keep earlier results, p: previous step", "start")
         except SetupStopped:
             return False
         if answer == "p":
             number = max(0, number - 1)
-        elif answer == "n" or (answer == "do it" and _is_done(setup, step)):
+        elif answer == "n" or (answer == "start" and _is_done(setup, step)):
             number += 1
     return True
 
@@ -108,7 +108,7 @@ def _is_done(setup: Setup, step: SetupStep) -> bool:
     try:
         figures = step.run(setup)
     except (SetupStopped, PhasestackError) as error:
-        stopped = "stopped; unfinished changes were not written to the configuration"
+        stopped = "stopped without writing unfinished changes to the configuration"
         setup.say(stopped if isinstance(error, SetupStopped) else f"failed: {error}")
         return False
     setup.done[step.name] = figures
@@ -134,14 +134,15 @@ def summarise(setup: Setup, *, finished: bool) -> tuple[dict[str, Any], str]:
     if finished:
         lines += [f"note: {note}" for figures in setup.done.values() for note in figures.get("notes", [])]
         write_json(setup.out / "setup.json", summary)
-        lines.append(f"{setup.out / 'setup.json'} contains the figures; {setup.config} is valid")
+        lines.append(f"the configuration {setup.config} is valid; the figures are in {setup.out / 'setup.json'}")
         if setup.hardware.simulated:
             lines.append(
-                f"try it: phasestack run --config {setup.config} --replay demo --headless --frames 60 --out run"
+                f"to try the setup, run: phasestack run --config {setup.config} --replay demo --headless "
+                "--frames 60 --out run"
             )
         else:
-            lines.append(f"try it: phasestack run --config {setup.config}")
-            lines.append(f"check it: phasestack doctor --config {setup.config}")
+            lines.append(f"to try the setup, run: phasestack run --config {setup.config}")
+            lines.append(f"to check the setup, run: phasestack doctor --config {setup.config}")
     if missing:
-        lines.append(f"not done: {', '.join(missing)} (run the same command to continue)")
+        lines.append(f"steps not done: {', '.join(missing)}; run the same command again to continue")
     return summary, "\n".join(lines)

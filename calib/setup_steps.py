@@ -86,30 +86,32 @@ def identify(setup: Setup) -> Figures:
     hardware, count = setup.hardware, setup.settings.stack.stack().count
     monitors = hardware.monitors()
     if len(monitors) < count:
-        raise InputError(setup.config, "stack.x_m", f"found {len(monitors)} monitors for {count} panels")
+        raise InputError(
+            setup.config, "stack.x_m", f"lists {count} panels, but only {len(monitors)} monitors are connected"
+        )
     free = list(range(len(monitors)))  # unassigned monitors; the first one shows its card
     tables: list[dict[str, Any]] = []
 
     def ask(question: str, keys: str, answers: Mapping[Key, Any]) -> Any:
         hardware.show_card(free[0], [question, f"{keys}; q: stop"])
-        setup.say(f"{monitors[free[0]]} shows its card while the others are clear. {question} ({keys}, q: stop)")
+        setup.say(f"{monitors[free[0]]} shows its card, and the other monitors are clear. {question} ({keys}, q: stop)")
         while (key := hardware.key()) not in answers:
             if key is Key.QUIT:
                 raise SetupStopped
         return answers[key]
 
     while len(tables) < count:
-        place = {0: "the rearmost, next to the backlight", count - 1: "the front one"}.get(len(tables), "the next one")
+        place = {0: "the rear panel, at the backlight", count - 1: "the front panel"}.get(len(tables), "the next panel")
         if not ask(f"Is this panel {len(tables)}, {place}?", "Enter: yes, n: no", YES_NO):
             free.append(free.pop(0))
             continue
-        arrow = ask("Seen from the front, which way does its arrow point?", "arrow keys", ARROWS)
-        readable = ask("Can you read its text, or is it mirrored?", "Enter: yes, n: no, it is mirrored", YES_NO)
+        arrow = ask("Seen from the front, which way does the arrow point?", "arrow keys", ARROWS)
+        readable = ask("Can you read the text, or is it mirrored?", "Enter: readable, n: mirrored", YES_NO)
         rotation_deg, mirror = mounting_of(arrow, mirrored=not readable)
         name = _name_of(monitors[free.pop(0)], monitors)
         tables.append(name | {"rotation_deg": rotation_deg, "mirror": mirror})
     rewrite(setup.config, lambda document: put_monitors(document, tables))
-    return {"text": f"{count} panels assigned to their monitors"}
+    return {"text": f"assigned {count} panels to their monitors"}
 
 
 def _name_of(monitor: Monitor, monitors: Sequence[Monitor]) -> dict[str, Any]:
@@ -132,13 +134,13 @@ def geometry(setup: Setup) -> Figures:
             try:
                 typed = float(answer) * unit_m
             except ValueError:
-                setup.say(f"{answer} is not a number")
+                setup.say(f"{answer} is not a number; try again")
                 continue
             return value_m if abs(typed - value_m) < 1e-8 else round(typed, 7)
 
     size: dict[str, Any] = {
         "width_m": length_m("width of a panel's active area", stack.width_m),
-        "height_m": length_m("its height", stack.height_m),
+        "height_m": length_m("height of a panel's active area", stack.height_m),
     }
     gap_m = (stack.x_m[-1] - stack.x_m[0]) / (len(stack.x_m) - 1)
     typed_m = length_m("distance from one panel to the next", gap_m)
@@ -147,7 +149,7 @@ def geometry(setup: Setup) -> Figures:
         size["x_m"] = [round((index - middle) * typed_m, 7) for index in range(len(stack.x_m))]
     near_m = length_m("nearest viewer", calibration.viewing_m[0], 1.0)
     far_m = length_m("farthest viewer", calibration.viewing_m[1], 1.0)
-    ipd_m = length_m("distance between the eyes of the person who calibrates (PD; 0: unknown)", calibration.ipd_m)
+    ipd_m = length_m("pupillary distance of the person who calibrates (0 if unknown)", calibration.ipd_m)
 
     def change(document: Any) -> None:
         put(document, "stack", size)
@@ -155,7 +157,7 @@ def geometry(setup: Setup) -> Figures:
 
     rewrite(setup.config, change)
     width_mm, height_mm = (1e3 * size[name] for name in ("width_m", "height_m"))
-    return {"text": f"{width_mm:.1f} by {height_mm:.1f} mm; viewers {near_m:.2f} to {far_m:.2f} m away"}
+    return {"text": f"panels of {width_mm:.1f} by {height_mm:.1f} mm, viewers {near_m:.2f} to {far_m:.2f} m away"}
 
 
 def registration(setup: Setup) -> Figures:
@@ -165,7 +167,7 @@ def registration(setup: Setup) -> Figures:
     pictures = setup.hardware.photographs(settings, boards(settings.stack.stack()), panel=None, say=setup.say)
     summary = register_photos(pictures, "photographs", setup.out / "registration", settings, config=setup.config)
     gaps = ", ".join(f"{gap * 1e3:.2f}" for gap in summary["gap_m"])
-    figures = f"gaps {gaps} mm, from {summary['used']} photographs; uncertainty equivalent to"
+    figures = f"gaps of {gaps} mm measured from {summary['used']} photographs, with an uncertainty equivalent to"
     return {"text": f"{figures} {summary['eye_error_mm']:.2f} mm at the eye", "notes": summary["notes"]}
 
 
@@ -179,7 +181,7 @@ def grey(setup: Setup) -> Figures:
     residuals = [0.0]
     for number in range(stack.count):
         state = "has a curve" if known[number] else "has no curve yet"
-        while setup.ask(f"panel {number} {state}: measure it? (y or n)", "y") == "y":
+        while setup.ask(f"panel {number} {state}; measure it now? (y or n)", "y") == "y":
             try:
                 residuals.append(_measure_grey(setup, number))
             except InputError as error:
@@ -188,10 +190,10 @@ def grey(setup: Setup) -> Figures:
             known[number] = True
             break
     if not any(known):
-        setup.say("no panel has a curve, so the configured gammas are used")
+        setup.say("no panel has a curve, so the display will use the configured gammas")
         raise SetupStopped
     numbers = ", ".join(str(n) for n, has in enumerate(known) if has)
-    return {"text": f"of panels {numbers}, measured to {100 * max(residuals):.2f}%"}
+    return {"text": f"curves of panels {numbers}, measured to {100 * max(residuals):.2f}%"}
 
 
 def _measure_grey(setup: Setup, panel: int) -> float:
@@ -232,11 +234,13 @@ def calibration(setup: Setup) -> Figures:
     pairs_path, target = setup.out / "pairs.csv", setup.out / "calibration.toml"
     count = capture_live(pairs_path, setup.settings, setup.hardware, show=True, say=setup.say)["pairs"]
     if count < MIN_PAIRS:
-        setup.say(f"{pairs_path} contains {count} pairs, but at least {MIN_PAIRS} are needed")
+        setup.say(
+            f"{pairs_path} contains {count} pairs, but at least {MIN_PAIRS} are needed; run this step again to add more"
+        )
         raise SetupStopped
     summary = solve_file(pairs_path, target, settings=setup.settings)
     rewrite(setup.config, lambda document: put(document, "calibration", {"file": str(target.resolve())}))
-    text = f"expected error at the eye {summary['eye_error_mm']:.1f} mm, from {summary['pairs']} pairs"
+    text = f"the expected error at the eye is {summary['eye_error_mm']:.1f} mm, from {summary['pairs']} pairs"
     return {"text": text, "notes": summary["warnings"]}
 
 
@@ -255,14 +259,14 @@ def service(setup: Setup) -> Figures:
     ]
     listed = "; ".join(commands)
     if setup.hardware.simulated or sudo:
-        setup.say("the service uses a copy of these files; install it with\n    " + "\n  ".join(commands))
-        return {"text": f"{len(files)} files; install them with: {listed}"}
+        setup.say("the service uses copies of these files; install them with\n    " + "\n  ".join(commands))
+        return {"text": f"gathered {len(files)} files; install them with: {listed}"}
     setup.hardware.let_go()  # the service needs the panels
     for command in commands:
         result = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=False)
         if result.returncode != 0:
             raise InputError(setup.config, "service", f"{command}: {result.stderr.strip() or 'failed'}")
-    return {"text": f"{len(files)} files, installed with: {listed} (previous files: *.~1~)"}
+    return {"text": f"installed {len(files)} files with: {listed} (backups of previous files end in .~1~)"}
 
 
 def gather(config: Path, out: Path) -> list[str]:
@@ -298,22 +302,24 @@ def gather(config: Path, out: Path) -> list[str]:
 
 STEPS = (
     SetupStep(
-        "identify", "Assign monitors to panels", "each monitor shows a card in turn; say which panel it is", identify
+        "identify", "Assign monitors to panels", "each monitor shows a card in turn; say which panel you see", identify
     ),
     SetupStep(
         "geometry",
         "Enter sizes and distances",
-        "size of the panels, approximate gap, distance of the viewers",
+        "enter the size of the panels, the approximate gap and the distance of the viewers",
         geometry,
     ),
-    SetupStep("registration", "Register the panels", "a dozen hand-held photographs of test patterns", registration),
-    SetupStep("grey", "Measure the panels' grey curves", "two photographs of a chart on each panel", grey),
-    SetupStep("sensor", "Choose the depth sensor", "the sensor that tracks the viewer's eyes", sensor),
+    SetupStep(
+        "registration", "Register the panels", "take a dozen hand-held photographs of test patterns", registration
+    ),
+    SetupStep("grey", "Measure the panels' grey curves", "take two photographs of a chart on each panel", grey),
+    SetupStep("sensor", "Choose the depth sensor", "choose the sensor that tracks the viewer's eyes", sensor),
     SetupStep(
         "calibration",
         "Calibrate the sensor",
-        "at 9 to 27 viewpoints, stand where the lines fuse and press Enter (q: enough)",
+        "at 9 to 27 viewpoints, stand where the lines fuse and press Enter; press q when you have enough",
         calibration,
     ),
-    SetupStep("service", "The service", "gather the service's files and, as root, install them", service),
+    SetupStep("service", "The service", "gather the service's files and, if run as root, install them", service),
 )

@@ -126,9 +126,9 @@ def fit(sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> Similarity:
             more than `ROTATION_BOUND_RAD`. Measurement noise is not considered.
     """
     if len(sensor_m) < 3:
-        raise Degenerate(f"{len(sensor_m)} pairs: at least 3 are needed")
+        raise Degenerate(f"there are only {len(sensor_m)} pairs, but at least 3 are needed")
     if not (np.isfinite(sensor_m).all() and np.isfinite(stack_m).all()):
-        raise Degenerate("not every coordinate is finite")
+        raise Degenerate("some coordinates are not finite")
     _refuse_degenerate("sensor", sensor_m)
     first, second = _refuse_degenerate("stack", stack_m)
     # Scale by powers of two, which is exact. Without scaling, the squares of 1e-200 m or 1e200 m would fall outside
@@ -140,7 +140,9 @@ def fit(sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> Similarity:
     if first > POLISH_ABOVE * second:
         unit = _polished(unit, unit_sensor, unit_stack, rule=unit_rule)
     if not (np.isfinite(unit.scale) and unit.scale > 0):
-        raise Degenerate("sensor and stack points are not correlated: the pairs do not belong together")
+        raise Degenerate(
+            "the sensor points and the stack points are not correlated; check that each pair belongs together"
+        )
     return Similarity(unit.scale * (stack_unit / sensor_unit), unit.rotation, unit.translation_m * stack_unit)
 
 
@@ -148,13 +150,13 @@ def _refuse_degenerate(name: str, points_m: F64) -> tuple[float, float]:
     first, second, _ = extents(points_m)
     magnitude = float(np.abs(points_m).max(initial=0.0))
     if first <= 4 * EPSILON * magnitude:
-        raise Degenerate(f"the {name} points coincide")
+        raise Degenerate(f"the {name} points coincide; use viewpoints that are apart")
     if second <= 4 * EPSILON * magnitude or second <= 1e-13 * first:
-        raise Degenerate(f"the {name} points are on one line, so the rotation about it is unknown")
+        raise Degenerate(f"the {name} points are on one line, so the rotation about that line is unknown")
     bound = 4 * EPSILON * magnitude / second  # verified with 50-digit arithmetic: `phasestack stability`
     if bound > ROTATION_BOUND_RAD:
         raise Degenerate(
-            f"the {name} points are too thin or too far from the origin for double precision: "
+            f"the {name} points are too close to one line or too far from the origin for double precision: "
             f"rounding alone rotates the result by up to {bound:.1g} rad"
         )
     return float(first), float(second)

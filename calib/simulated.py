@@ -54,15 +54,15 @@ class SimulatedHardware(SetupHardware):
     def show_card(self, number: int, words: Sequence[str]) -> None:
         rotation_deg, mirror = self.mounted[number]
         self._say(
-            f"(simulated: it is panel {self.order[number]}; its arrow points {'down' if rotation_deg else 'up'}, its "
-            f"writing is {'mirrored' if mirror != 'none' else 'not mirrored'})"
+            f"(simulated: this is panel {self.order[number]}, the arrow points {'down' if rotation_deg else 'up'} and "
+            f"the text is {'mirrored' if mirror != 'none' else 'not mirrored'})"
         )
 
     def photographs(self, settings: Settings, pictures: U8, *, panel: int | None, say: Say) -> Iterator[Named]:
         folder = self._photos if panel is None else self._photos / f"grey-{panel}"
         if not folder.is_dir():
             raise InputError(
-                folder, "", "contains no photographs, because the display is simulated; press n to skip this step"
+                folder, "", "contains no photographs because the display is simulated; press n to skip this step"
             )
         return photographs(folder)
 

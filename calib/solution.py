@@ -195,8 +195,8 @@ def solve_default(sensor_m: F64, stack_m: F64) -> CalibrationSolution:
         stack_m,
         method="fixed-scale",
         known_scale=scale,
-        reason=f"scale {scale:.5g} ± {sigma * scale:.2g}: fitted {fitted:.5g} ± {inverse.scale_sigma * fitted:.2g}, "
-        f"prior 1 or off by about {100 * SCALE_PRIOR[1, 1]:g}%",
+        reason=f"scale {scale:.5g} ± {sigma * scale:.2g} from the fitted {fitted:.5g} ± "
+        f"{inverse.scale_sigma * fitted:.2g} and the prior of 1 or off by about {100 * SCALE_PRIOR[1, 1]:g}%",
     )
     unit = solution.unit_covariance.copy()
     # Taken about the pairs' centre, the scale is independent of the rotation and the shift.

@@ -51,7 +51,7 @@ def solve_file(
     volume_m = viewing_volume_m(settings.calibration)
     try:
         chosen = (
-            solve(pairs.sensor_m, pairs.stack_m, method=method, known_scale=known_scale, reason="asked for")
+            solve(pairs.sensor_m, pairs.stack_m, method=method, known_scale=known_scale, reason="as requested")
             if method
             else solve_default(pairs.sensor_m, pairs.stack_m)
         )
@@ -106,7 +106,7 @@ def calibration_text(
         The TOML text.
     """
     document = tomlkit.document()
-    document.add(tomlkit.comment("Made by `phasestack calibrate solve`. Lengths in metres, angles in radians."))
+    document.add(tomlkit.comment("Written by `phasestack calibrate solve`. Lengths are in metres, angles in radians."))
     document["stack_from_sensor"] = _rows(solution.similarity.matrix)
     document.update({
         "units": "m",
@@ -127,7 +127,9 @@ def calibration_text(
         "eye_error_m": float(solution.eye_error_m(volume_m).mean()),
     }
     covariance = tomlkit.table()
-    covariance.add(tomlkit.comment("of rotation vector, shift and log scale about the pivot, in the stack's axes"))
+    covariance.add(
+        tomlkit.comment("Covariance of the rotation vector, shift and log scale about the pivot, in the stack's axes.")
+    )
     covariance["pivot_m"] = solution.pivot_m.tolist()
     covariance["matrix"] = _rows(solution.covariance)
     document["covariance"] = covariance

@@ -33,7 +33,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
         with torch.serialization.safe_globals([argparse.Namespace]):
             table: dict[str, Any] = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except Exception as error:  # a damaged pickle can raise anything
-        raise InputError(path, "", f"is not a checkpoint of plain weights ({one_line(str(error), most=120)})") from None
+        raise InputError(path, "", f"is not a checkpoint of plain weights: {one_line(str(error), most=120)}") from None
     state = table.get("model") if isinstance(table, dict) else None
     if not isinstance(state, Mapping) or not state or not all(isinstance(v, Tensor) for v in state.values()):
         raise InputError(path, "model", 'is missing; a checkpoint must have the form {"model": state_dict}')
@@ -74,7 +74,7 @@ def fill(net: nn.Module, state: Mapping[str, Tensor], *, source: str | Path, arc
         raise InputError(source, (missing or surplus)[0], "; ".join(problem))
     for key, value in state.items():
         if value.shape != expected[key].shape:
-            shapes = f"{tuple(value.shape)}, but {arch} has {tuple(expected[key].shape)}"
+            shapes = f"has the shape {tuple(value.shape)}, but {arch} has {tuple(expected[key].shape)}"
             raise InputError(source, key, shapes)
         if not torch.isfinite(value).all():
             raise InputError(source, key, "contains numbers that are not finite")

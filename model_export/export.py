@@ -72,7 +72,7 @@ def export_model(
         data = picture_file(network, origin, eye_order=eye_order, **size)
     else:
         if checkpoint is not None or random_init is not None:
-            problem = f"{arch} is built from its recipe, without --checkpoint or --random-init"
+            problem = f"{arch} is built from its recipe; omit --checkpoint and --random-init"
             raise InputError("export", "--arch", problem)
         data, module = spectral_model(arch)
     report = check_model(data, source=str(out), reference=in_torch(module))
@@ -144,7 +144,9 @@ def picture_network(
     """
     if checkpoint is None:
         if random_init is None:
-            raise InputError("export", "--checkpoint", f"or --random-init is required: {arch}'s weights aren't shipped")
+            raise InputError(
+                "export", "--checkpoint", f"or --random-init is required because the weights of {arch} are not shipped"
+            )
         network = make_network(arch, options, seed=random_init)
         return network, hashlib.sha256(f"{arch} {network.options} random {random_init}".encode()).hexdigest()
     table = load_checkpoint(checkpoint)

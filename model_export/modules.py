@@ -38,9 +38,10 @@ class Form(Section):
     )
     input_value: Literal["intensity", "phase"] = "intensity"
     output: Literal["panels"] = "panels"
-    branch: Literal[1, 2] = Field(1, description="branch of phase sums: [0, 1] or [1, 2]")
+    branch: Literal[1, 2] = Field(1, description="branch of the phase sums: 1 for [0, 1] or 2 for [1, 2]")
     picture_fov_deg: Annotated[float, Field(ge=0, lt=180)] = Field(
-        0.0, description="horizontal field of view of its pictures, which are black beyond it; 0: the content's own"
+        0.0,
+        description="horizontal field of view of its pictures, which are black outside; 0 for that of the content",
     )
 
     steps: Annotated[int, Field(ge=0, le=STEPS_MOST)] = Field(
@@ -95,7 +96,7 @@ def blamed(arch: str, field: str) -> Iterator[None]:
 def check_known(arch: str, *others: str) -> None:
     """Raise InputError unless `arch` names a network or has the form `module:Class`."""
     if not is_plugin(arch) and arch not in (*others, *KNOWN):
-        raise InputError("--arch", "", f"{arch!r} is neither {', '.join([*others, *KNOWN])} nor module:Class")
+        raise InputError("--arch", "", f"{arch!r} is not a network; use {', '.join([*others, *KNOWN])} or module:Class")
 
 
 def make_network(arch: str, options: dict[str, Any], *, seed: int = 0) -> Network:
@@ -131,11 +132,11 @@ def probe(network: Network, *, width_px: int, height_px: int) -> None:
     with torch.no_grad(), blamed(arch, f"forward, of {tuple(example.shape)}"):
         answer = network.net.eval()(example)
     if not isinstance(answer, Tensor):
-        raise InputError(arch, "forward", f"returns {type(answer).__name__}; it must return one tensor")
+        raise InputError(arch, "forward", f"returns {type(answer).__name__}, but must return one tensor")
     shape = tuple(answer.shape)
     for axis, size, needed in zip(("batch", "channels", "height", "width"), shape, expected, strict=False):
         if size != needed or len(shape) != len(expected):
-            problem = f"returns {shape} instead of {expected}: {axis}"
+            problem = f"returns the shape {shape} instead of {expected}; check the {axis}"
             raise InputError(arch, "forward", f"{problem} ({PANELS} panels of {COLOURS} colours)")
     if answer.dtype != torch.float32:
         raise InputError(arch, "forward", f"returns {answer.dtype} instead of torch.float32")

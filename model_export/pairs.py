@@ -125,7 +125,7 @@ def folder_pairs(folder: Path) -> tuple[Pair, ...]:
     """
     name = next((name for name in preset_names() if name in folder.resolve().name), "")
     if not name:
-        raise InputError(folder, "name", f"contains none of {', '.join(preset_names())}")
+        raise InputError(folder, "name", f"the folder's name must contain one of {', '.join(preset_names())}")
     if not folder.is_dir():
         raise InputError(folder, "", "is not a folder")
     return read_folder(folder, name)

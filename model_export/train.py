@@ -113,7 +113,9 @@ def run_training(out: Path, training: Training, *, device: Device = "auto", resu
                 optimizer.zero_grad(set_to_none=True)
                 loss.backward()  # type: ignore[no-untyped-call]
             if not torch.isfinite(loss):
-                raise InputError(training.arch, f"iteration {number}", "its light is not finite")
+                raise InputError(
+                    training.arch, f"iteration {number}", "the light is not finite; lower the learning rate"
+                )
             nn.utils.clip_grad_norm_(net.parameters(), 1.0)
             optimizer.step()
             rate.step()
@@ -121,9 +123,7 @@ def run_training(out: Path, training: Training, *, device: Device = "auto", resu
             progress(number, training.iterations)
             if stop:
                 save(number)
-                line = (
-                    f"train: stopped after iteration {number} of {training.iterations}; --resume continues from there"
-                )
+                line = f"train: stopped after iteration {number} of {training.iterations}; pass --resume to continue"
                 print(line, file=sys.stderr)
                 raise SystemExit(128 + stop[0])
             if number % training.validate_every and number != training.iterations:
@@ -228,7 +228,7 @@ def _data(training: Training, form: Form) -> tuple[TrainingPairs, TrainingPairs]
     if stack is not None:
         stack = replace(stack, width_px=width_px, height_px=height_px)
         if stack.count != PANELS:
-            raise InputError(training.panels, "x_m", f"has {stack.count} panels, but picture networks need {PANELS}")
+            raise InputError(training.panels, "x_m", f"has {stack.count} panels, but picture networks require {PANELS}")
     if training.data and training.scene:
         raise InputError("train", "--data", "cannot be combined with --scene")
     folder = folder_pairs(Path(training.data)) if training.data else ()
@@ -253,7 +253,7 @@ def _loader(pairs: TrainingPairs, training: Training, first: int, last: int) -> 
 
 def _placed(device: Device) -> torch.device:
     if device == "cuda" and not torch.cuda.is_available():
-        raise InputError("train", "--device", "cuda is not available, because torch finds no GPU")
+        raise InputError("train", "--device", "cuda is not available because torch finds no GPU")
     return torch.device("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
 
 
@@ -283,10 +283,10 @@ def _resumed(
     table = load_checkpoint(path)
     was, now = table.get("training"), training.model_dump()
     if not isinstance(was, dict) or "curve" not in table:
-        raise InputError(path, "training", "missing: not a checkpoint of phasestack train")
+        raise InputError(path, "training", "is missing, so this is not a checkpoint of `phasestack train`")
     for name, value in now.items():
         if was.get(name) != value:
-            raise InputError(path, name, f"must be {was.get(name)!r}, as before, to resume the training, not {value!r}")
+            raise InputError(path, name, f"must be {was.get(name)!r} to resume this training, not {value!r}")
     fill(network.net, table["model"], source=path, arch=training.arch)
     with blamed(str(path), "optimizer"):
         for part, name in zip(parts, ("optimizer", "rate"), strict=True):

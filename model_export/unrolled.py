@@ -22,7 +22,7 @@ class Unrolled(nn.Module):
         """The number of steps and their initial size."""
 
         steps: Annotated[int, Field(ge=1, le=64)] = 4
-        size: Annotated[float, Field(gt=0, le=3)] = Field(SIZE, description="size of every step before training")
+        size: Annotated[float, Field(gt=0, le=3)] = Field(SIZE, description="size of each step before training")
 
     def __init__(self, steps: int, size: float) -> None:
         super().__init__()

@@ -58,7 +58,7 @@ class Report:
 
     def table(self) -> str:
         """Return a readable table of the checks, each with its result and requirement."""
-        rows = [f"{'ok' if c.passed else 'FAILED':8}{c.name}: {c.found}; wanted: {c.wanted}" for c in self.checks]
+        rows = [f"{'ok' if c.passed else 'FAILED':8}{c.name}: {c.found}; expected: {c.wanted}" for c in self.checks]
         failed = sum(not check.passed for check in self.checks)
         end = f"{failed} of {len(self.checks)} checks failed" if failed else f"all {len(self.checks)} checks passed"
         return "\n".join([self.file, *rows, end])
@@ -94,7 +94,7 @@ def check_model(data: bytes, *, source: str, reference: Reference | None = None)
         model = onnx.load_from_string(data)
         onnx.checker.check_model(model)
     except Exception as error:  # errors from protobuf and onnx
-        raise InputError(source, "", f"is not an ONNX model ({_said(error)})") from None
+        raise InputError(source, "", f"is not an ONNX model: {_said(error)}") from None
     contract = parse_contract({item.key: item.value for item in model.metadata_props}, source=source)
     checks = [Check("contract", f"{contract.arch} {contract.name}", f"version {VERSION}", True)]
     try:

@@ -18,7 +18,9 @@ def _import_ours(name: str) -> None:
     loaded = sys.modules.get(name)
     if loaded is not None:
         if not loaded.__file__ or Path(loaded.__file__).resolve() != init:
-            raise ImportError(f"phasestack has a package `{name}`; rename yours ({loaded.__file__ or loaded.__path__})")
+            raise ImportError(
+                f"phasestack needs the package name `{name}`; rename yours at {loaded.__file__ or loaded.__path__}"
+            )
         return
     spec = spec_from_file_location(name, init, submodule_search_locations=[str(init.parent)])
     assert spec is not None and spec.loader is not None

@@ -136,7 +136,7 @@ class Result:
     @property
     def _line(self) -> str:
         line = f"model {self.model}, solved for a tracking error of {self.eye_sigma_mm:g} mm; "
-        return line + f"one ray a pixel, as published: {self._pair.quality.psnr_db:.1f} dB"
+        return line + f"PSNR with one ray per pixel, as published: {self._pair.quality.psnr_db:.1f} dB"
 
     def show(self) -> Path:
         """Open a browser page that shows the layers and the eyes' views.
@@ -299,12 +299,12 @@ def evaluate(
     wanted = (pair.stack.count, pair.stack.height_px, pair.stack.width_px)
     if given.ndim != 4 or given.shape[:3] != wanted or given.shape[3] not in (3, 4):
         last = given.ndim == 4 and given.shape[1] in (3, 4) and given.shape[3] not in (3, 4)
-        advice = "; channels must come last: np.moveaxis(layers, 1, -1)" if last else ""
-        advice = "; for grey layers use np.stack([layers] * 3, -1)" if given.shape == wanted else advice
-        raise ValueError(f"layers: must have the shape {(*wanted, 3)} of the stack, not {given.shape}{advice}")
+        advice = "; channels must come last, so pass np.moveaxis(layers, 1, -1)" if last else ""
+        advice = "; for grey layers, pass np.stack([layers] * 3, -1)" if given.shape == wanted else advice
+        raise ValueError(f"layers: must have the shape {(*wanted, 3)}, not {given.shape}{advice}")
     if np.issubdtype(given.dtype, np.floating) and 1 < given.max() <= np.pi / 2:
         raise ValueError(
-            f"layers: values are up to {given.max():g}, not 1; if they are angles in radians, divide by pi/2"
+            f"layers: values must be at most 1, not {given.max():g}; if they are angles in radians, divide by pi/2"
         )
     codes = [as_codes(as_picture(f"layers[{n}]", layer[..., :3])) for n, layer in enumerate(given)]
     return _measured(pair.judged(np.stack(codes)), how)
@@ -318,16 +318,16 @@ def _measured(pair: SolvedPair, how: Measuring) -> PairQuality:
         ValueError: An option is out of range. The message names the option.
     """
     if unknown := sorted(how.keys() - Measuring.__annotations__.keys()):
-        raise TypeError(f"{unknown[0]}: no such argument")
+        raise TypeError(f"{unknown[0]}: unknown argument; use {' or '.join(Measuring.__annotations__)}")
     if not how:
         return pair.quality
     sigmas_mm, every = how.get("sigmas_mm", SIGMAS_MM), how.get("every", 1)
     if not isinstance(sigmas_mm, Sequence) or not sigmas_mm:
-        raise ValueError(f"sigmas_mm: is {sigmas_mm!r}, not a sequence of tracking errors in mm such as (1,)")
+        raise ValueError(f"sigmas_mm: must be a sequence of tracking errors in mm such as (1,), not {sigmas_mm!r}")
     sigmas = [_number("sigmas_mm", sigma_mm, 0.0, 1000.0, "mm") for sigma_mm in sigmas_mm]
     most = min(pair.pictures[0].shape[:2]) // EVERY_LEAST
     if isinstance(every, bool) or not isinstance(every, int | np.integer) or not 1 <= every <= most:
-        raise ValueError(f"every: is {every!r}, not a whole number of pixels from 1 to {most}")
+        raise ValueError(f"every: must be a whole number of pixels from 1 to {most}, not {every!r}")
     return pair.sampled(sigmas_mm=sigmas, every=int(every))
 
 
@@ -351,7 +351,7 @@ def camera(eye_m: Sequence[float] | F64, *, width_px: int, height_px: int, fov_d
         _number(name, size, 1, 1 << 16, "pixels")
     eye = np.asarray(eye_m, np.float64)
     if eye.shape != (3,) or not np.isfinite(eye).all() or not eye.any():
-        raise ValueError("eye_m: must be three finite numbers in metres, not all 0")
+        raise ValueError("eye_m: must be three finite numbers in metres that are not all 0")
     return image_from_stack(eye, fov_deg=_number("fov_deg", fov_deg, *FOV_RANGE_DEG, "degrees"), **sizes)
 
 
@@ -375,7 +375,7 @@ def project(
     """
     points = np.asarray(points_m, np.float64)
     if points.ndim < 1 or points.shape[-1] != 3:
-        raise ValueError(f"points_m: has the shape {points.shape}, not (..., 3)")
+        raise ValueError(f"points_m: must have the shape (..., 3), not {points.shape}")
     matrix = camera(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
     seen = points @ matrix[:, :3].T + matrix[:, 3]
     depth = np.where(seen[..., 2:] > 0, seen[..., 2:], np.nan)
@@ -397,19 +397,19 @@ def _checked(
     """
     pictures = [as_picture(name, picture) for name, picture in zip(("left", "right"), given, strict=True)]
     if pictures[0].shape != pictures[1].shape:
-        raise ValueError(f"right: is {pictures[1].shape}, left is {pictures[0].shape}: both must have the same shape")
+        raise ValueError(f"right: must have the same shape as left, {pictures[0].shape}, not {pictures[1].shape}")
     stack = checked_stack(stack)
     fov_deg = _number("fov_deg", fov_deg, *FOV_RANGE_DEG, "degrees")
     if cameras is None:
         if eyes_m is None:
-            raise ValueError("eyes_m: must be given (left and right eye in metres) unless cameras are")
+            raise ValueError("eyes_m: is required without cameras; pass the left and right eye in metres")
         eyes = _eyes(eyes_m, stack)
     else:
         try:
             matrices, places_m = as_cameras(cameras)
             eyes = _eyes(places_m, stack)
             if eyes_m is not None and np.abs(_eyes(eyes_m, stack) - eyes).max() > SAME_PLACE_M:
-                raise ValueError(f"stand at {np.round(eyes, 4).tolist()}, but eyes_m are elsewhere; omit eyes_m")
+                raise ValueError(f"are at {np.round(eyes, 4).tolist()}, which contradicts eyes_m; omit eyes_m")
             pictures, fov_deg = looking_at_origin(pictures, matrices, eyes, stack)
         except ValueError as error:
             raise ValueError(f"cameras: {error}") from None
@@ -418,14 +418,14 @@ def _checked(
     pair = _Pair(tuple(pictures), eyes, stack, fov_deg, is_resampled=cameras is not None)
     black = np.zeros((stack.count, stack.height_px, stack.width_px, 3), np.uint8)
     if not all(seen_by(eye, black, stack, fov_deg=fov_deg, width_px=64, height_px=64).mask.any() for eye in eyes):
-        raise ValueError("eyes_m: no part of the display is visible from there")
+        raise ValueError("eyes_m: an eye cannot see any part of the display; move the eyes in front of the panels")
     return pair
 
 
 def _number(name: str, given: Any, low: float, high: float, unit: str) -> float:
     """Return a number as a float. Raises ValueError unless it is a number from `low` to `high`."""
     if isinstance(given, bool) or not isinstance(given, int | float | np.integer | np.floating):
-        raise ValueError(f"{name}: is {given!r}, not a number of {unit}")
+        raise ValueError(f"{name}: must be a number of {unit}, not {given!r}")
     if problem := refusal(float(given), low, high, unit):
         raise ValueError(f"{name}: {problem}")
     return float(given)
@@ -433,7 +433,7 @@ def _number(name: str, given: Any, low: float, high: float, unit: str) -> float:
 
 def _name_of(model: Any) -> str:
     if not isinstance(model, str | os.PathLike):
-        raise ValueError(f"model: is {model!r}, not fast, balanced, best, sart or an ONNX file")
+        raise ValueError(f"model: must be fast, balanced, best, sart or an ONNX file, not {model!r}")
     return os.fspath(model)
 
 
@@ -452,14 +452,16 @@ def _eyes(eyes_m: Any, stack: PanelStack) -> F64:
     try:
         eyes = np.asarray(eyes_m, np.float64)
     except (TypeError, ValueError):
-        raise ValueError("eyes_m: must be two points of three numbers, in metres") from None
+        raise ValueError("eyes_m: must be two points of three numbers in metres") from None
     if eyes.shape != (2, 3) or not np.isfinite(eyes).all():
-        raise ValueError(f"eyes_m: has the shape {eyes.shape}; must be two points of three finite numbers, in metres")
+        raise ValueError(f"eyes_m: must be two points of three finite numbers in metres; the shape is {eyes.shape}")
     if np.abs(eyes).max() > EYE_MOST_M:
         raise ValueError(f"eyes_m: {refusal(float(np.abs(eyes).max()), -EYE_MOST_M, EYE_MOST_M, 'm')}")
     if eyes[:, 0].min() <= stack.x_m[-1]:
-        raise ValueError(f"eyes_m: x = {eyes[:, 0].min():g} m is not in front of the panels (x > {stack.x_m[-1]:g})")
+        raise ValueError(
+            f"eyes_m: x = {eyes[:, 0].min():g} m is not in front of the panels; x must exceed {stack.x_m[-1]:g} m"
+        )
     apart_m = float(np.linalg.norm(eyes[0] - eyes[1]))
     if apart_m < SEPARATION_MIN_M:
-        raise ValueError(f"eyes_m: eyes are {apart_m * 1e3:g} mm apart; the minimum is 5 mm")
+        raise ValueError(f"eyes_m: the eyes are {apart_m * 1e3:g} mm apart, but the minimum is 5 mm")
     return eyes

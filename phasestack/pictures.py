@@ -34,15 +34,17 @@ def as_picture(name: str, given: Any) -> Picture:
     """
     picture: Any = _from_pillow(name, given) if hasattr(given, "getbands") else as_array(name, given)
     if picture.ndim != 3 or picture.shape[2] not in (3, 4) or min(picture.shape[:2]) < LEAST_PX:
-        told = f"has the shape {picture.shape}, not (h, w, 3|4) with at least {LEAST_PX} pixels"
+        told = f"must have the shape (h, w, 3) or (h, w, 4), with h and w at least {LEAST_PX}, not {picture.shape}"
         raise ValueError(f"{name}: {told}{_advice_on_shape(name, picture)}")
     if picture.dtype != np.uint8:
         if not np.issubdtype(picture.dtype, np.floating):
-            told = f"has dtype {picture.dtype}, neither uint8 (0..255) nor floating point (0..1)"
+            told = f"must be uint8 (0 to 255) or floating point (0 to 1), not {picture.dtype}"
             raise ValueError(f"{name}: {told}{_advice_on_type(name, picture)}")
         low, high = (float(bound) for bound in (picture.min(), picture.max()))
         if not (low >= -SLACK and high <= 1 + SLACK):  # also refuses NaN
-            raise ValueError(f"{name}: values are {low:g} to {high:g}, not 0 to 1{_advice_on_range(name, low, high)}")
+            raise ValueError(
+                f"{name}: values must be from 0 to 1, not {low:g} to {high:g}{_advice_on_range(name, low, high)}"
+            )
         picture = picture.astype(np.float32).clip(0, 1)
     if picture.shape[2] == 3:
         return np.ascontiguousarray(picture)
@@ -59,7 +61,9 @@ def as_array(name: str, given: Any) -> Any:
         ValueError: The value is a file name, or is not an array of numbers. The message begins with `name`.
     """
     if isinstance(given, str | os.PathLike):
-        raise ValueError(f"{name}: is a file name; read the file first, e.g. with PIL.Image.open({os.fspath(given)!r})")
+        raise ValueError(
+            f"{name}: must be a picture, not a file name; read it with PIL.Image.open({os.fspath(given)!r})"
+        )
     if hasattr(given, "detach"):  # a torch tensor
         given = given.detach().cpu()
         given = given.float() if given.is_floating_point() else given
@@ -70,7 +74,7 @@ def as_array(name: str, given: Any) -> Any:
     if array.dtype.name == "bfloat16":  # a jax array
         array = array.astype(np.float32)
     if array.dtype.kind not in "buif":
-        raise ValueError(f"{name}: is {type(given).__name__}, not an array of numbers")
+        raise ValueError(f"{name}: must be an array of numbers, not {type(given).__name__}")
     return array
 
 
@@ -84,35 +88,37 @@ def _from_pillow(name: str, image: Any) -> U8:
     except InputError as error:
         raise ValueError(str(error)) from None
     except OSError as error:  # Pillow notices that a file is truncated only when its pixels are read
-        raise ValueError(f"{name}: cannot be decoded ({error})") from None
+        raise ValueError(f"{name}: cannot be decoded: {error}") from None
 
 
 def _advice_on_shape(name: str, picture: Any) -> str:
     if picture.ndim == 2 or (picture.ndim == 3 and picture.shape[2] == 1):
-        return f": for a grey picture use np.dstack([{name}] * 3)"
+        return f"; for a grey picture, pass np.dstack([{name}] * 3)"
     if picture.ndim == 3 and picture.shape[0] in (3, 4):
-        return f": channels must come last; use np.moveaxis({name}, 0, -1)"
-    return f": pass one picture, {name}[0]" if picture.ndim == 4 and picture.shape[0] == 1 else ""
+        return f"; channels must come last, so pass np.moveaxis({name}, 0, -1)"
+    return f"; pass one picture, such as {name}[0]" if picture.ndim == 4 and picture.shape[0] == 1 else ""
 
 
 def _advice_on_type(name: str, picture: Any) -> str:
     if picture.dtype == np.bool_:
-        return f": codes are {name} * np.uint8(255)"
+        return f"; pass {name} * np.uint8(255)"
     if picture.min() >= 0 and picture.max() <= 255:
-        return f": codes are {name}.astype(np.uint8)"
-    return f": {name} / 65535 if that is white" if picture.dtype == np.uint16 else ": divide by the value of white"
+        return f"; pass {name}.astype(np.uint8)"
+    return (
+        f"; if white is 65535, pass {name} / 65535" if picture.dtype == np.uint16 else "; divide by the value of white"
+    )
 
 
 def _advice_on_range(name: str, low: float, high: float) -> str:
     if not np.isfinite([low, high]).all():
-        return ": some values are not finite"
+        return "; some values are not finite"
     if low >= -OVERSHOOT and high <= 1 + OVERSHOOT:
-        return f": clip it, np.clip({name}, 0, 1)"
+        return f"; pass np.clip({name}, 0, 1)"
     if low >= -1 - OVERSHOOT and high <= 1 + OVERSHOOT:
-        return f": from -1 to 1 it is ({name} + 1) / 2"
+        return f"; if the range is -1 to 1, pass ({name} + 1) / 2"
     if low >= -255 * OVERSHOOT and high <= 255 * (1 + OVERSHOOT):
-        return f": divide by 255, np.clip({name} / 255, 0, 1)"
-    return f": divide by 65535, np.clip({name} / 65535, 0, 1)" if low >= 0 and high <= 65535 else ""
+        return f"; if white is 255, pass np.clip({name} / 255, 0, 1)"
+    return f"; if white is 65535, pass np.clip({name} / 65535, 0, 1)" if low >= 0 and high <= 65535 else ""
 
 
 def as_codes(picture: Picture) -> U8:

@@ -38,7 +38,7 @@ class Stack(PanelStack):
         try:
             places = tuple(float(x) for x in x_m)
         except (TypeError, ValueError):
-            raise ValueError(f"x_m: is {x_m!r}; must list the panels' positions, such as (-0.03, 0.0, 0.03)") from None
+            raise ValueError(f"x_m: must list the panels' positions, such as (-0.03, 0.0, 0.03), not {x_m!r}") from None
         try:
             checked = validated(StackGeometry, {**given, "x_m": places}, source="")
         except InputError as error:
@@ -49,5 +49,5 @@ class Stack(PanelStack):
 def checked_stack(stack: object) -> PanelStack:
     """Return a stack as a plain `PanelStack`. Raises ValueError if the argument is not a stack."""
     if not isinstance(stack, PanelStack):
-        raise ValueError(f"stack: is a {type(stack).__name__}: create a phasestack.Stack")
+        raise ValueError(f"stack: must be a phasestack.Stack, not {type(stack).__name__}")
     return PanelStack(*(getattr(stack, field.name) for field in fields(PanelStack)))

@@ -3,11 +3,11 @@
 set -eu
 usage() {
   cat <<'HELP'
-Install phasestack for the whole machine. Run `sh systemd/install.sh` as root, or `make install`.
+Install phasestack system-wide. Run `sh systemd/install.sh` as root, or `make install`.
 
-  DESTDIR=/some/root  build the tree of a package there, and start or reload nothing on this machine
-  PYTHON=python3.11   Python that will run phasestack (3.11 or later)
-  APP=no              install only units, rules and configuration; the program comes from elsewhere
+  DESTDIR=/some/root  install into this tree, as for a package, without changing this machine
+  PYTHON=python3.11   Python interpreter to run phasestack with (3.11 or later)
+  APP=no              install only the units, rules and configuration, not the program
 
 Example: DESTDIR=/tmp/tree PYTHON=python3.12 sh systemd/install.sh
 HELP
@@ -15,7 +15,7 @@ HELP
 case "${1:-}" in
   '') ;;
   -h | --help) usage; exit 0 ;;
-  *) echo "install: unknown argument $1 (see --help)" >&2; exit 2 ;;
+  *) echo "install: unknown argument $1; see --help" >&2; exit 2 ;;
 esac
 # The user of the service must be able to read the installed files.
 umask 022
@@ -24,9 +24,9 @@ source=$(dirname -- "$here")
 DESTDIR=${DESTDIR:-}
 python=$(command -v "${PYTHON:-python3}") || { echo "install: ${PYTHON:-python3}: not found" >&2; exit 2; }
 "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
-  || { echo "install: $python: Python 3.11 or later is needed" >&2; exit 2; }
+  || { echo "install: $python: Python 3.11 or later is required" >&2; exit 2; }
 if [ -z "$DESTDIR" ] && [ "$(id -u)" != 0 ]; then
-  echo "install: run as root, or set DESTDIR" >&2
+  echo "install: must be run as root unless DESTDIR is set" >&2
   exit 2
 fi
 
@@ -98,11 +98,11 @@ put 644 ../THIRD_PARTY.md /usr/share/doc/phasestack/THIRD_PARTY.md
 if [ "$live" = yes ]; then
   systemd-sysusers
   systemd-tmpfiles --create phasestack.conf
-  { udevadm control --reload && udevadm trigger --subsystem-match=usb; } || echo "install: udev is not running"
+  { udevadm control --reload && udevadm trigger --subsystem-match=usb; } || echo "install: udev is not running, so its rules were not reloaded"
   systemctl daemon-reload
   # shellcheck disable=SC2086
   if [ -n "$running" ] && ! systemctl start $running; then
-    echo "install: the new version does not start; the previous one is restored. Reason:" >&2
+    echo "install: the new version failed to start; restoring the previous version. Reason:" >&2
     systemctl show phasestack --property=StatusText --value >&2
     systemctl stop $running 2>/dev/null || true
     rm -rf "$library.new"
@@ -115,8 +115,9 @@ if [ "$live" = yes ]; then
 fi
 rm -rf "$DESTDIR$library.old"
 cat <<NEXT
-phasestack is installed${DESTDIR:+ in $DESTDIR}. Next:
-  1. phasestack setup (docs/setup.md), or edit /etc/phasestack/phasestack.toml (phasestack identify, phasestack doctor)
-  2. systemctl enable --now phasestack
-  3. systemctl enable --now phasestack-page   (the operator's page: http://localhost:8717)
+phasestack is installed${DESTDIR:+ in $DESTDIR}. Next steps:
+  1. run phasestack setup (docs/setup.md), or edit /etc/phasestack/phasestack.toml with the help of phasestack identify
+     and phasestack doctor
+  2. run systemctl enable --now phasestack
+  3. run systemctl enable --now phasestack-page to serve the operator's page at http://localhost:8717
 NEXT

@@ -10,18 +10,18 @@ case ${1:-} in
   slow) wanted="$runtime $testing $slow" ;;
   *) wanted=$runtime ;;
 esac
-command -v dpkg-query >/dev/null || { echo "This is not Debian; please install the equivalents of: $wanted"; exit 0; }
+command -v dpkg-query >/dev/null || { echo "This is not Debian; install the equivalents of: $wanted"; exit 0; }
 missing=""
 for name in $wanted; do
   dpkg-query -W -f='${Status}' "$name" 2>/dev/null | grep -q "install ok installed" || missing="$missing $name"
 done
 [ -z "$missing" ] && exit 0
 if [ "$(id -u)" != 0 ]; then
-  echo "Please have root run: apt-get install$missing"
+  echo "Packages are missing; run as root: apt-get install$missing"
   exit 0
 fi
-echo "Installing Debian's packages:$missing"
+echo "Installing Debian packages:$missing"
 export DEBIAN_FRONTEND=noninteractive
 # shellcheck disable=SC2086
 { apt-get update -qq && apt-get install -y -qq --no-install-recommends $missing; } >/dev/null \
-  || echo "They could not be installed; please run: apt-get install$missing"
+  || echo "The packages could not be installed; run: apt-get install$missing"

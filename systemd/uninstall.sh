@@ -3,9 +3,9 @@
 set -eu
 usage() {
   cat <<'HELP'
-Remove what install.sh has installed. Run `sh systemd/uninstall.sh` as root, or `make uninstall`.
+Remove everything that install.sh installed. Run `sh systemd/uninstall.sh` as root, or `make uninstall`.
 
-  DESTDIR=/some/root  tree in which it was installed
+  DESTDIR=/some/root  tree that phasestack was installed into
   PURGE=yes           also remove the configuration and the state
 
 Example: PURGE=yes sh systemd/uninstall.sh
@@ -14,11 +14,11 @@ HELP
 case "${1:-}" in
   '') ;;
   -h | --help) usage; exit 0 ;;
-  *) echo "uninstall: unknown argument $1 (see --help)" >&2; exit 2 ;;
+  *) echo "uninstall: unknown argument $1; see --help" >&2; exit 2 ;;
 esac
 DESTDIR=${DESTDIR:-}
 if [ -z "$DESTDIR" ] && [ "$(id -u)" != 0 ]; then
-  echo "uninstall: run as root, or set DESTDIR" >&2
+  echo "uninstall: must be run as root unless DESTDIR is set" >&2
   exit 2
 fi
 live=no
@@ -44,8 +44,8 @@ if [ "$live" = yes ]; then
   systemctl daemon-reload
   udevadm control --reload 2>/dev/null || true
 fi
-echo "phasestack is removed${DESTDIR:+ from $DESTDIR}"
+echo "phasestack was removed${DESTDIR:+ from $DESTDIR}"
 for left in /etc/phasestack /var/lib/phasestack; do
-  [ ! -e "$DESTDIR$left" ] || echo "  left: $DESTDIR$left (PURGE=yes removes it)"
+  [ ! -e "$DESTDIR$left" ] || echo "  kept $DESTDIR$left; PURGE=yes removes it"
 done
-[ "$live" = no ] || ! id phasestack >/dev/null 2>&1 || echo "  left: the user and group phasestack (userdel phasestack)"
+[ "$live" = no ] || ! id phasestack >/dev/null 2>&1 || echo "  kept the user and group phasestack; userdel phasestack removes them"

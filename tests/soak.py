@@ -42,7 +42,7 @@ LOST_EVERY_S = 30.0
 HARM_EVERY_S = 40.0  # a cable, or the panels' contexts
 FAILING = 0.002  # of the solver's steps
 REFUSED = (
-    "favour of a newer change",
+    "superseded by a newer change",
     "there is no next entry",
     "nobody's",
     "the display loop did not answer",

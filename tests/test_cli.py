@@ -74,12 +74,15 @@ def solve_arguments(folder: Path, **changes: object) -> list[str]:
         ({"right_eye": (0.6, -0.03, 0.0)}, "--right-eye"),
         ({"right_eye": (0.6, -0.0251, 0.0)}, "--right-eye: is 4.9 mm from the left eye"),
         ({"left_eye": (0.061, 40.0, 0.0), "right_eye": (0.061, 40.06, 0.0)}, "--left-eye"),
-        ({"left_eye": (0.6, 1e30, 0)}, "--left-eye: 1e+30 m is beyond 50 m"),
+        ({"left_eye": (0.6, 1e30, 0)}, "--left-eye: 1e+30 m is out of range; use -50 to 50 m"),
         (
             {"left_eye": (0.6, 0, 0), "right_eye": (0.66, 0, 0), "model": "fast"},
-            "--right-eye: the eyes have no horizontal separation",
+            "--right-eye: fast does not support these eye positions (the eyes have no horizontal separation",
         ),
-        ({"left_eye": (50, 50, 50), "right_eye": (0.07, -50, -50), "model": "fast"}, "--right-eye: implausible"),
+        (
+            {"left_eye": (50, 50, 50), "right_eye": (0.07, -50, -50), "model": "fast"},
+            "--right-eye: fast does not support these eye positions (implausible",
+        ),
         ({"fov": 180}, "--fov"),
         ({"fov": 1e-320}, "--fov"),
         ({"model": "quick"}, "solve: --model: 'quick'"),
@@ -107,7 +110,7 @@ def test_a_decoder_s_complaint_about_a_damaged_picture_is_in_the_line(pair: Path
     result = phasestack(*solve_arguments(pair, left=pair / "damaged.png"))
     assert result.returncode == 2
     (line,) = result.stderr.strip().splitlines()
-    assert "damaged.png: is not an image that can be decoded (it is damaged)" in line
+    assert "damaged.png: cannot be decoded as an image because the file is damaged" in line
 
 
 def test_a_folder_in_a_layer_s_place_is_named_and_nothing_replaced(pair: Path) -> None:
@@ -129,7 +132,7 @@ def test_pictures_of_different_sizes_are_refused(pair: Path) -> None:
         ({**PANELS, "depth_m": 1}, "depth_m"),
         ({"width_m": 0.5, "height_m": 0.3}, "x_m"),
         ({**PANELS, "x_m": [0.01 * n for n in range(9)]}, "x_m: must list 2 to 8 panels"),
-        ({"stack": PANELS}, "width_m: is missing; in a panels file it belongs at the top, not under [stack]"),
+        ({"stack": PANELS}, "width_m: is missing; in a panels file, move it from [stack] to the top level"),
     ],
 )
 def test_panels_that_make_no_stack_are_refused_by_field(pair: Path, table: dict[str, object], field: str) -> None:
@@ -160,8 +163,10 @@ def test_one_file_that_holds_both_views_is_solved_as_two(pair: Path, name: str, 
 def test_one_view_is_refused_and_so_is_a_layout_for_two_files(pair: Path) -> None:
     arguments = solve_arguments(pair)
     at = arguments.index("--right")
-    assert "left.png: layout: holds 1 view: give --right, or --layout" in refusal(*arguments[:at], *arguments[at + 2 :])
-    assert "solve: --layout: requires one file with both views" in refusal(*arguments, "--layout", "side-by-side")
+    assert "left.png: layout: contains 1 view; pass --right or another --layout" in refusal(
+        *arguments[:at], *arguments[at + 2 :]
+    )
+    assert "solve: --layout: cannot be combined with --right" in refusal(*arguments, "--layout", "side-by-side")
     assert "--layout: layout" in refusal("run", "--replay", "demo", "--headless", "--layout", "sideways")
 
 

@@ -25,22 +25,30 @@ PANEL = '[[output.panels]]\nconnector = "DP-{}"\n'
 @pytest.mark.parametrize(
     ("text", "field", "said"),
     [
-        ("[stack]\nwidth_m = 518.4", "stack.width_m", "did you mean millimetres (0.5184)?"),
-        ("[stack]\nx_m = [-60, 0, 60]", "stack.x_m.0", "did you mean millimetres (-0.06)?"),
+        ("[stack]\nwidth_m = 518.4", "stack.width_m", "for 518.4 millimetres, write 0.5184"),
+        ("[stack]\nx_m = [-60, 0, 60]", "stack.x_m.0", "for -60 millimetres, write -0.06"),
         ("[stack]\nx_m = [0.0, 1e-9, 0.06]", "stack.x_m", "apart; the minimum is"),
-        ("[stack]\nwidth_m = 1e-30", "stack.width_m", "below 0.005 m"),
-        ("[stack]\nwidth_m = 1e308", "stack.width_m", "beyond 20 m"),
-        ("[stack]\nheight_m = 0.5", "stack.height_m", "did you mean height_m = 0.2916? (or set stack.pixel_aspect)"),
-        ("[calibration]\nipd_m = 6.3", "calibration.ipd_m", "did you mean centimetres (0.063)?"),
-        ("[calibration]\nviewing_m = [400, 600]", "calibration.viewing_m.0", "did you mean millimetres (0.4)?"),
-        ("[tracker]\nhold_s = 500", "tracker.hold_s", "did you mean milliseconds (0.5)?"),
-        ("[sensor]\nfixed_eyes_m = [[600, -31, 0], [600, 31, 0]]", "sensor.fixed_eyes_m.0.0", "millimetres (0.6)"),
-        ("[content]\ndepth_m = [-50, 50]", "content.depth_m.0", "did you mean millimetres (-0.05)?"),
-        ("[loop]\nrate_hz = 60000", "loop.rate_hz", "the range is 1 to 1000 Hz"),
+        ("[stack]\nwidth_m = 1e-30", "stack.width_m", "out of range; use 0.005 to 20 m"),
+        ("[stack]\nwidth_m = 1e308", "stack.width_m", "out of range; use 0.005 to 20 m"),
+        (
+            "[stack]\nheight_m = 0.5",
+            "stack.height_m",
+            "did you mean height_m = 0.2916? Otherwise change stack.pixel_aspect",
+        ),
+        ("[calibration]\nipd_m = 6.3", "calibration.ipd_m", "for 6.3 centimetres, write 0.063"),
+        ("[calibration]\nviewing_m = [400, 600]", "calibration.viewing_m.0", "for 400 millimetres, write 0.4"),
+        ("[tracker]\nhold_s = 500", "tracker.hold_s", "for 500 milliseconds, write 0.5"),
+        (
+            "[sensor]\nfixed_eyes_m = [[600, -31, 0], [600, 31, 0]]",
+            "sensor.fixed_eyes_m.0.0",
+            "for 600 millimetres, write 0.6",
+        ),
+        ("[content]\ndepth_m = [-50, 50]", "content.depth_m.0", "for -50 millimetres, write -0.05"),
+        ("[loop]\nrate_hz = 60000", "loop.rate_hz", "out of range; use 1 to 1000 Hz"),
         ("[loop]\nsimulated_stage_ms = { render = -1 }", "loop.simulated_stage_ms.render", "greater than or equal"),
         ("[loop.simulated_stage_ms]\nrendr = 1", "loop.simulated_stage_ms", "not a stage: did you mean render?"),
         ("[model]\neffort = 'half'", "model.effort", "'auto' or 'full'"),
-        ("[[output.panels]]\ngamma = 1e308", "output.panels.0.gamma", "beyond 10"),
+        ("[[output.panels]]\ngamma = 1e308", "output.panels.0.gamma", "out of range; use 0.1 to 10"),
         ("[[output.panels]]\nhomography = [[1, 0, 0], [0, 1, 0]]", "output.panels.0.homography.2", "required"),
         (PANEL.format(1) + PANEL.format(2), "output.panels", "must have 3 tables"),
         ("[modle]\nname = 'fast'", "modle", "did you mean model?"),
@@ -84,7 +92,7 @@ def test_a_panels_file_takes_its_pixels_from_the_pictures_whatever_their_shape(t
     file.write_text(json.dumps({"width_m": 0.5184, "height_m": 0.2916, "x_m": [-0.06, 0, 0.06]}))
     assert load_stack(file, width_px=600, height_px=800).width_px == 600
     file.write_text(json.dumps({"width_m": 518.4, "height_m": 291.6, "x_m": [-60, 0, 60]}))
-    with pytest.raises(InputError, match=r"panels\.json: width_m: .*millimetres \(0\.5184\)"):
+    with pytest.raises(InputError, match=r"panels\.json: width_m: .*for 518\.4 millimetres, write 0\.5184"):
         load_stack(file, width_px=600, height_px=800)
 
 

@@ -73,7 +73,7 @@ def test_an_error_in_a_thread_is_told_so_too(tmp_path: Path) -> None:
 
 def test_without_memory_it_may_pass(tmp_path: Path) -> None:
     answer = broken("raise MemoryError", tmp_path)
-    assert (answer.returncode, answer.stderr) == (75, "phasestack: out of memory; try again\n")
+    assert (answer.returncode, answer.stderr) == (75, "phasestack: out of memory; close other programs and try again\n")
 
 
 @pytest.mark.parametrize(("error", "code"), [("FatalError", 2), ("PanelLost", 75)])
@@ -96,7 +96,7 @@ def test_a_full_disk_behind_the_output_is_told() -> None:
     with open("/dev/full", "w") as full:  # noqa: PTH123
         answer = run("config", stdout=full)
     assert answer.returncode == 2
-    assert answer.stderr == "phasestack: output: cannot be written (No space left on device)\n"
+    assert answer.stderr == "phasestack: output: cannot be written: No space left on device\n"
 
 
 def test_closed_descriptors_are_no_error_and_no_file_takes_their_place(tmp_path: Path) -> None:

@@ -80,13 +80,13 @@ def test_the_advice_of_a_refusal_makes_a_picture(given: Any, advice: str) -> Non
 @pytest.mark.parametrize(
     ("given", "told"),
     [
-        ("a.png", r"is a file name; read the file first, e.g. with PIL.Image.open\('a.png'\)"),
+        ("a.png", r"must be a picture, not a file name; read it with PIL.Image.open\('a.png'\)"),
         (Path("a.png"), r"PIL.Image.open\('a.png'\)"),
-        ([[1, 2], [3]], "is list, not an array of numbers"),
-        (np.full((20, 30, 3), "a"), "is ndarray, not an array of numbers"),
-        (None, "is NoneType, not an array"),
-        (np.full((20, 30, 3), np.nan), "values are nan to nan, not 0 to 1: some values are not finite"),
-        (np.zeros((4, 4, 3), np.uint8), "with at least 16 pixels"),
+        ([[1, 2], [3]], "must be an array of numbers, not list"),
+        (np.full((20, 30, 3), "a"), "must be an array of numbers, not ndarray"),
+        (None, "must be an array of numbers, not NoneType"),
+        (np.full((20, 30, 3), np.nan), "values must be from 0 to 1, not nan to nan; some values are not finite"),
+        (np.zeros((4, 4, 3), np.uint8), "with h and w at least 16"),
         (CODES.astype(np.int32) - 9, "divide by the value of white"),
     ],
 )

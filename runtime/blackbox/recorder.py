@@ -244,7 +244,7 @@ class Recorder(logging.Handler):
             saved: Function called with an error message (empty on success) and the file.
         """
         if not self._most_ns or self._presenter is None:
-            saved("the black box is switched off (service.blackbox_minutes is 0)", None)
+            saved("the black box is switched off; set service.blackbox_minutes above 0", None)
             return
         with self._waiting_lock:
             self._waiting.setdefault(kind, []).append(saved)
@@ -275,7 +275,7 @@ class Recorder(logging.Handler):
                 make_room(self._folder)
             except OSError as error:
                 log.error("the black box could not be written: %s", error)
-                problem = f"{self._folder}: cannot be written ({error.strerror})"
+                problem = f"{self._folder}: cannot be written: {error.strerror}"
             for saved in listeners:
                 saved(problem, None if problem else self._last_file)
 
@@ -444,7 +444,7 @@ def _find_cut(folder: Path) -> None:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             at = datetime.fromtimestamp(journal.stat().st_mtime, UTC)
             journal.rename(path := _next_name(folder, CUT, at))
-            log.warning("the previous run was killed; its last minutes are in %s", path)
+            log.warning("the previous run did not exit cleanly; its last minutes are in %s", path)
 
 
 def make_room(folder: Path) -> None:

@@ -72,7 +72,7 @@ class BrowserLink:
         if eyes_m is not None:
             eyes = np.array(eyes_m, np.float64)
             if eyes.shape != (2, 3) or not np.isfinite(eyes).all() or eyes[:, 0].min() <= self.stack.x_m[-1]:
-                raise ValueError("eyes: must be two points in front of the front panel, in metres")
+                raise ValueError("eyes: must be two points in metres that are in front of the front panel")
         with self._arrived:
             self._samples.append(SeenEyes(eyes, float(page_ms)))
             self._arrived.notify()

@@ -14,7 +14,7 @@ app = typer.Typer()
 def bench(
     context: typer.Context,
     out: Annotated[Path | None, typer.Option(help="write the measurement to this JSON file")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print the result as one JSON object")] = False,
 ) -> None:
     """Measure the shipped models' run time, memory and light PSNR, or compare two measurements.
 
@@ -41,8 +41,8 @@ def bench(
 
 @app.command()
 def compare(
-    old: Annotated[Path, typer.Argument(help="JSON file of the earlier measurement")],
-    new: Annotated[Path, typer.Argument(help="JSON file of the later measurement")],
+    old: Annotated[Path, typer.Argument(help="JSON file with the earlier measurement")],
+    new: Annotated[Path, typer.Argument(help="JSON file with the later measurement")],
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
 ) -> None:
     """List every figure that changed by more than the noise. Exits with 1 if any figure got worse.
@@ -64,13 +64,13 @@ def compare(
         print(to_json({"worse": len(worse), "changes": rows, "times_compared": not busy, "too_busy": busy}))
     else:
         for why in busy:
-            print(f"run times are not compared because the machine was too busy: {why}")
+            print(f"not comparing run times because the machine was too busy: {why}")
         speed = after.yardstick_ms / before.yardstick_ms
-        print(f"the reference workload takes {speed:.2f} times as long as before; solution times are corrected for it")
+        print(f"the reference workload took {speed:.2f} times as long as before; solution times are scaled to match")
         for change in sorted(changes, key=lambda change: not change.worse):
             print(f"{'worse ' if change.worse else 'better'} {change.what}: {change.text}")
-        again = "; run times could not be compared, so measure again" if busy else ""
+        again = ", but run times could not be compared; measure again on an idle machine" if busy else ""
         ends = f"{len(worse)} worse, {len(changes) - len(worse)} better"
-        print(ends if changes else f"nothing changed by more than the noise{again}")
+        print(ends if changes else f"no figure changed by more than the noise{again}")
     if worse:
         raise typer.Exit(1)

@@ -41,11 +41,13 @@ def place(
     scale: Annotated[float | None, number(0.001, 1000, help="scale factor of the scene")] = None,
     offset: Annotated[
         tuple[float, float, float] | None,
-        number(-10, 10, "m", help="displacement in metres: out of the screen, to the right, up"),
+        number(-10, 10, "m", help="offset in metres (out of the screen, to the right, up)"),
     ] = None,
     rotate: Annotated[
         tuple[float, float, float] | None,
-        number(-360, 360, "degrees", help="rotation in degrees about the axes out, right and up"),
+        number(
+            -360, 360, "degrees", help="rotation in degrees about the axes that point out of the screen, right and up"
+        ),
     ] = None,
     turntable: Annotated[
         float | None, number(-600, 600, help="rotation speed about the vertical axis, in turns per minute; 0 stops it")
@@ -64,7 +66,9 @@ def place(
     options = {"scale": scale, "offset_m": offset, "rotation_deg": rotate, "turntable_per_min": turntable}
     value = {name: option for name, option in options.items() if option is not None}
     if reset == bool(value):
-        raise InputError("ctl place", "", "use either --reset or one of --scale, --offset, --rotate, --turntable")
+        raise InputError(
+            "ctl place", "", "pass either --reset or at least one of --scale, --offset, --rotate and --turntable"
+        )
     tell({"command": "place", "value": None if reset else value}, config)
 
 
@@ -90,7 +94,7 @@ PLAIN = {
     "flat": "Show the flat (2D) picture until `resume`.",
     "reload": "Reload the configuration file. If it is invalid, the old configuration stays in use.\n\n"
     "A scene, model or placement set by `ctl` stays unless the file has changed that setting.",
-    "blackbox": "Save the last two minutes (eyes, states, times, log) as an MCAP file and print its name.",
+    "blackbox": "Save the last two minutes of eyes, states, times and log lines to an MCAP file and print its name.",
 }  # commands that take no argument
 
 
@@ -155,5 +159,8 @@ def status(
         raise typer.Exit(1) from None
     typer.echo(shown(answer, as_json=as_json))
     if float(answer.get("turn_age_s", 0.0)) > HUNG_AFTER_S:
-        typer.echo(f"the display loop has hung for {answer['turn_age_s']:.0f} s", err=True)
+        typer.echo(
+            f"the display loop has not responded for {answer['turn_age_s']:.0f} s; see journalctl -u phasestack",
+            err=True,
+        )
         raise typer.Exit(1)

@@ -16,7 +16,8 @@ LONGEST_S, LEAST = 45.0, 15  # the demo's time limit; minimum number of refreshe
 def demo(
     out: Annotated[Path, typer.Option(help="folder for pictures, frames.jsonl and summary.json")] = Path("out/demo"),
     frames: Annotated[
-        int, typer.Option(min=1, help="refreshes to show; all 600 of the recording take several minutes")
+        int,
+        typer.Option(min=1, help="number of refreshes to show; the whole recording has 600 and takes several minutes"),
     ] = FRAMES,
     as_json: Annotated[bool, typer.Option("--json", help="print the summary as one JSON object")] = False,
 ) -> None:
@@ -40,7 +41,7 @@ def demo(
         def stop_reason(self) -> str:
             self._asked += 1
             is_over = self._asked >= LEAST and time.monotonic() > self._ends_s
-            return f"the time limit of {LONGEST_S:g} s is up" if is_over else ""
+            return f"reached the time limit of {LONGEST_S:g} s" if is_over else ""
 
     every = MEASURED_EVERY if frames <= 4 * FRAMES else 60  # one measurement takes as long as ten refreshes
     settings = changed(Settings(), "loop", {"evaluate_every": every}, source="demo")

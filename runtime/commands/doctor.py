@@ -48,7 +48,9 @@ def doctor(
     ] = None,
     as_service: Annotated[
         bool,
-        typer.Option("--service", help="check as the service's user, with its groups and configuration (needs root)"),
+        typer.Option(
+            "--service", help="check with the user, groups and configuration of the systemd service; requires root"
+        ),
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print the result as one JSON object")] = False,
 ) -> None:
@@ -91,14 +93,16 @@ def _become_service() -> None:
 
     unit = unit_properties("User", "Group", "SupplementaryGroups", "Environment", "WorkingDirectory", "StateDirectory")
     if not unit:
-        raise InputError("doctor", "--service", "phasestack.service is not installed")
+        raise InputError("doctor", "--service", "phasestack.service is not installed; run systemd/install.sh first")
     try:
         os.setgroups([grp.getgrnam(name).gr_gid for name in unit["SupplementaryGroups"].split()])
         os.setgid(grp.getgrnam(unit["Group"]).gr_gid)
         os.setuid(pwd.getpwnam(unit["User"]).pw_uid)
         os.chdir(unit["WorkingDirectory"])
     except (OSError, KeyError) as error:
-        raise InputError("doctor", "--service", f"cannot become the service's user ({error}); use sudo") from None
+        raise InputError(
+            "doctor", "--service", f"cannot switch to the service's user ({error}); run this command with sudo"
+        ) from None
     os.environ |= dict(entry.partition("=")[::2] for entry in shlex.split(unit["Environment"]))
     os.environ["STATE_DIRECTORY"] = f"/var/lib/{unit['StateDirectory']}"
 
@@ -134,7 +138,7 @@ def sensor(settings: Settings) -> Iterator[Row]:
 
     if settings.sensor.driver not in NO_DEVICE and (answer := _daemon(settings)):
         eyes = answer.get("eyes_label", "unknown")
-        yield Row("sensor", "skip", f"the running daemon is using it (eyes: {eyes})")
+        yield Row("sensor", "skip", f"not checked because the running daemon is using the sensor (eyes: {eyes})")
         return
     driver = open_sensor(settings.sensor, MonotonicClock())
     own = is_plugin(settings.sensor.driver)
@@ -143,7 +147,7 @@ def sensor(settings: Settings) -> Iterator[Row]:
         driver.open()
         frame = driver.read_newest(CHECK_SENSOR_FOR_S)
     except (SensorLost, SensorTimeout, EndOfRecording) as error:
-        remedy = "see docs/sensors.md" if own else "connect it; see the usb rows and docs/planning.md"
+        remedy = "see docs/sensors.md" if own else "connect the sensor; see the usb rows and docs/planning.md"
         yield Row("sensor", "fail", f"{what}: {error or 'no sample arrived'}", remedy)
         return
     finally:
@@ -168,7 +172,7 @@ def usb(settings: Settings) -> Iterator[Row]:
     try:
         devices = find_devices()
     except MissingPart as error:
-        yield Row("usb", absent, str(error), "install it" if needed else "")
+        yield Row("usb", absent, str(error), "install libusb" if needed else "")
         return
     if not devices:
         remedy = "connect a depth camera; docs/planning.md lists the supported ones" if needed else ""
@@ -193,7 +197,7 @@ def opengl(settings: Settings) -> Iterator[Row]:
             yield Row("opengl", "warn", f"this user cannot open {node}", "add the user to the groups video and render")
     software = any(name in found["renderer"].lower() for name in ("llvmpipe", "softpipe", "swrast"))
     bad = software and (settings.output.kind != "offscreen" or settings.model.backend == "gl")
-    slow = "software rendering is slow; if there is a GPU, install its driver" if software else ""
+    slow = "software rendering is slow; if this machine has a GPU, install its driver" if software else ""
     yield Row("opengl", "warn" if bad else "ok", f"{found['renderer']}, {found['version']} ({found['vendor']})", slow)
 
 
@@ -204,7 +208,7 @@ def monitors(settings: Settings) -> Iterator[Row]:
     from runtime.panels.registry import panel_settings
 
     if settings.output.kind == "offscreen":
-        yield Row("monitors", "skip", "no monitor is used because output.kind is offscreen")
+        yield Row("monitors", "skip", "not checked because output.kind is offscreen")
         return
     from runtime.panels.display import connected_monitors
 
@@ -222,7 +226,7 @@ def monitors(settings: Settings) -> Iterator[Row]:
             "monitor",
             "ok",
             str(monitor),
-            "" if known else "it has no EDID serial number; identify it by its connector",
+            "" if known else "this monitor reports no EDID serial number; select it by connector instead",
         )
     try:
         bound = bind(panels, there)
@@ -281,16 +285,19 @@ def _rate(predictor: Predictor, backend: SolverBackend, settings: Settings) -> R
     stack = predictor.stack
     raster = f"{stack.width_px}x{stack.height_px}"
     if predictor.on_panels(stack) is None:
-        return Row("rate", "skip", f"{predictor.name} cannot be timed")
+        return Row("rate", "skip", f"cannot time the model {predictor.name}")
     coarse = replace(stack, width_px=max(64, stack.width_px // 4), height_px=max(64, stack.height_px // 4))
-    took_ms, how = 16 * solution_ms(predictor, coarse, backend, runs=3), f"estimated from {coarse.width_px} columns"
+    took_ms, how = (
+        16 * solution_ms(predictor, coarse, backend, runs=3),
+        f"estimated at a width of {coarse.width_px} pixels",
+    )
     if took_ms < MEASURED_MS:
         took_ms, how = solution_ms(predictor, stack, backend, runs=1), "measured"
-    detail = f"{raster}: {took_ms:.0f} ms per full solution, {1000 / took_ms:.1f} per second ({how})"
+    detail = f"{raster}: {took_ms:.0f} ms per full solution, or {1000 / took_ms:.1f} per second ({how})"
     if took_ms < SLOW_MS:
         return Row("rate", "ok", detail)
     coarser = "moving viewers will see coarser pictures; " if settings.model.effort == "auto" else ""
-    sharper = "a GPU, the model `fast` or fewer pixels would help (docs/planning.md)"
+    sharper = "use a GPU, the model `fast` or panels with fewer pixels (see docs/planning.md)"
     return Row("rate", "warn", detail, coarser + sharper)
 
 
@@ -302,14 +309,14 @@ def calibration(settings: Settings) -> Iterator[Row]:
     if not settings.calibration.file:
         driver = settings.sensor.driver
         if is_plugin(driver) and plugin_class(driver, Sensor, field="sensor.driver").capabilities.in_stack_frame:
-            yield Row("calibration", "ok", "not needed: this sensor delivers eyes in the stack's frame")
+            yield Row("calibration", "ok", "not needed because this sensor already delivers eyes in the stack's frame")
             return
         real = driver not in NO_DEVICE
         remedy = "run `phasestack calibrate capture` and `calibrate solve`, then set calibration.file" if real else ""
         yield Row(
             "calibration",
             "fail" if real else "ok",
-            "calibration.file is not set; the demo's calibration is used",
+            "calibration.file is not set, so the demo's calibration is in use",
             remedy,
         )
         return
@@ -332,7 +339,10 @@ def service(settings: Settings) -> Iterator[Row]:
     age_s = float(answer.get("turn_age_s", 0.0))
     if age_s > HUNG_AFTER_S:
         yield Row(
-            "service", "fail", f"the display loop has hung for {age_s:.0f} s", "see the log: journalctl -u phasestack"
+            "service",
+            "fail",
+            f"the display loop has not responded for {age_s:.0f} s",
+            "see the log: journalctl -u phasestack",
         )
     elif state.startswith("degraded"):
         yield Row("service", "fail", f"{state} ({answer.get('reason', '')})", "see the log: journalctl -u phasestack")

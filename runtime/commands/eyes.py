@@ -15,18 +15,20 @@ JSON_S = 2.0  # how long a live sensor is watched with --json
 def eyes(
     files: Annotated[
         list[Path] | None,
-        typer.Argument(help="pictures, films or recordings (default: live frames from the configured sensor)"),
+        typer.Argument(
+            help="pictures, films or recordings to search (default: live frames from the configured sensor)"
+        ),
     ] = None,
     config: Annotated[Path | None, typer.Option(help="configuration file with the sensor to use")] = None,
     sequence: Annotated[
         bool, typer.Option("--sequence", help="follow the viewer from picture to picture, as the daemon does")
     ] = False,
     rate_hz: Annotated[
-        float, number(0.1, 1000, "Hz", help="frame rate of the pictures, and of films that do not give one")
+        float, number(0.1, 1000, "Hz", help="frame rate of the pictures, and of films that do not state their own")
     ] = 30.0,
-    out: Annotated[Path | None, typer.Option(help="folder for annotated copies, readable only by you")] = None,
+    out: Annotated[Path | None, typer.Option(help="folder for annotated copies that only you can read")] = None,
     as_json: Annotated[
-        bool, typer.Option("--json", help="print one JSON object; a live sensor is watched for two seconds")
+        bool, typer.Option("--json", help="print the result as one JSON object (watches a live sensor for two seconds)")
     ] = False,
 ) -> None:
     """Find the viewer's pupils and how uncertain their positions are. With --out, also draw them.

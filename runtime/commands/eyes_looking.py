@@ -50,7 +50,7 @@ class Watcher:
         if frame.colour is None:
             pupils, reason = (
                 None,
-                "this sensor delivers eyes, not pictures" if points else "no eyes in this sample",
+                "this sensor delivers eye positions but no pictures" if points else "this sample contains no eyes",
             )
         row = {
             "file": file,

@@ -87,13 +87,13 @@ def _reported(error: BaseException) -> int:
     if isinstance(error, BrokenPipeError):
         return STDOUT_CLOSED
     if isinstance(error, OSError) and error.errno == errno.ENOSPC:
-        _say(f"phasestack: {error.filename or 'output'}: cannot be written ({error.strerror})")
+        _say(f"phasestack: {error.filename or 'output'}: cannot be written: {error.strerror}")
         return BAD_INPUT
     if isinstance(error, PhasestackError):
         _say(f"phasestack: {one_line(str(error), most=2000)}")
         return MAY_PASS if isinstance(error, TransientError) else BAD_INPUT
     if isinstance(error, MemoryError):
-        _say("phasestack: out of memory; try again")
+        _say("phasestack: out of memory; close other programs and try again")
         return MAY_PASS
     from runtime.support.crash import written
 

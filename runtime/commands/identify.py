@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 def identify(
     config: Annotated[
-        Path | None, typer.Option(help="configuration file; without it, every monitor shows a card")
+        Path | None, typer.Option(help="configuration file with the panels (default: show a card on every monitor)")
     ] = None,
 ) -> None:
     """Show a test card on each panel: its index, monitor, colour bars and an arrow that should point up.
@@ -94,7 +94,7 @@ def _hold(panels: PanelSink, cards: list[U8], poll: Callable[[], Key | None]) ->
 
     lost, number = "", 0  # frame number, incremented at each key press
     shown, layers = 0, alone(cards, 0)
-    typer.echo("press Enter or n for the next panel, p for the previous one, q to quit")
+    typer.echo("press Enter or n for the next panel, p for the previous panel, or q to quit")
     try:
         while True:
             try:
@@ -103,7 +103,7 @@ def _hold(panels: PanelSink, cards: list[U8], poll: Callable[[], Key | None]) ->
             except PanelLost as error:
                 if str(error) != lost:
                     lost = str(error)
-                    typer.echo(f"lost: {lost}", err=True)
+                    typer.echo(f"a panel was lost: {lost}", err=True)
             key = poll()
             if key is Key.QUIT:
                 return

@@ -14,7 +14,10 @@ def page(
     config: Annotated[Path | None, typer.Option(help="configuration file that names the daemon's socket")] = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="port to listen on; 0 picks a free one")] = DEFAULT_PORT,
     token_file: Annotated[
-        Path | None, typer.Option(help="file with the login token, created if missing (default: in the state folder)")
+        Path | None,
+        typer.Option(
+            help="file with the login token, which is created if it does not exist (default: in the state folder)"
+        ),
     ] = None,
 ) -> None:
     """Serve the operator's page, used to watch and control the running daemon.
@@ -37,5 +40,5 @@ def page(
     with retry_advised():  # for example if the disk is full
         token = token_of(path)
     served = listening("page", port)
-    typer.echo(f"page: http://{LOOPBACK}:{served.getsockname()[1]}/ - the token is in {path}", err=True)
+    typer.echo(f"page: http://{LOOPBACK}:{served.getsockname()[1]}/ (log in with the token in {path})", err=True)
     server_of(application(DaemonClient(places), token)).run(sockets=[served])

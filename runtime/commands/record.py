@@ -30,12 +30,14 @@ def record(
     out: Annotated[Path, typer.Option(help="recording to write (.mcap)")],
     config: Annotated[Path | None, typer.Option(help="configuration file; `phasestack config` prints one")] = None,
     images: Annotated[
-        bool, typer.Option("--images", help="also record colour and depth pictures (these show faces)")
+        bool, typer.Option("--images", help="also record colour and depth pictures, which show people's faces")
     ] = False,
     seconds: Annotated[
         float | None, number(0.1, RECORD_MOST_S, "s", help="length in seconds (default: 600, or 12 with --motion)")
     ] = None,
-    motion: Annotated[str | None, typer.Option(help="simulate a head: still, lean, nod, walk or stop-and-go")] = None,
+    motion: Annotated[
+        str | None, typer.Option(help="record a simulated head instead: still, lean, nod, walk or stop-and-go")
+    ] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="seed of the head's path (only with --motion)")] = None,
     rate_hz: Annotated[float | None, number(15, 240, "Hz", help="samples per second (only with --motion)")] = None,
     noise_mm: Annotated[
@@ -58,14 +60,14 @@ def record(
     meaningless = {"config": config, "images": images or None} if motion is not None else simulated
     for name, value in meaningless.items():
         if value is not None:
-            what = "--motion" if motion is not None else "a sensor"
-            raise InputError("record", f"--{name.replace('_', '-')}", f"cannot be combined with {what}")
+            why = "cannot be combined with --motion" if motion is not None else "requires --motion"
+            raise InputError("record", f"--{name.replace('_', '-')}", why)
     if motion is not None:
         from runtime.evaluation.motion_recording import write_motion
 
         options: dict[str, Any] = {**simulated, "seconds": seconds}
         written = write_motion(out, motion, **{name: value for name, value in options.items() if value is not None})
-        summary = written | {"holds": ["eyes", "true eyes"], "stopped": "the motion has ended"}
+        summary = written | {"holds": ["eyes", "true eyes"], "stopped": "the motion ended"}
     else:
         from runtime.config import load_settings
 
@@ -89,11 +91,11 @@ def _refuse_target(out: Path, *, motion: bool) -> None:
     if out.suffix.lower() != SUFFIX:
         raise InputError(out, "--out", f"must end in {SUFFIX}, because recordings are MCAP files")
     if os.path.isdir(out):  # noqa: PTH112 - Path.is_dir raises if a parent folder is not accessible
-        raise InputError(out, "--out", "is a folder")
+        raise InputError(out, "--out", "is a folder; pass the name of a file")
     if not os.path.lexists(out):
         folder = next(folder for folder in out.absolute().parents if os.path.lexists(folder))
         if not os.access(folder, os.W_OK | os.X_OK):
-            raise InputError(out, "--out", "cannot be written (Permission denied)")
+            raise InputError(out, "--out", "cannot be written: Permission denied")
         return
     try:
         if motion and Recording(out).header.driver == "motion":
@@ -126,7 +128,7 @@ def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | N
 
     clock, s = MonotonicClock(), settings.sensor
     worker = SensorWorker(lambda: open_sensor(s, clock), s, clock, lambda: EyeFinder(settings).find, keep_images=images)
-    max_s, stopped = seconds or MAX_S, "the time is up"
+    max_s, stopped = seconds or MAX_S, "reached the time limit"
     writer, first_ns, so_far_s = None, 0, 0.0
     holds: dict[str, None] = {}
     with ExitStack() as cleanup:
@@ -147,21 +149,21 @@ def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | N
                     writer = cleanup.enter_context(recording_to(out, header, max_s=max_s))
                 if not writer.write(frame):
                     if frame.capture_ns - first_ns <= max_s * NS_PER_S:
-                        stopped = "the limit of 2 GiB is reached"
+                        stopped = "reached the limit of 2 GiB"
                     break
                 so_far_s = (frame.capture_ns - first_ns) / NS_PER_S
                 holds |= dict.fromkeys(_streams(frame))
-                progress.tell(f"recording: {writer.count} samples, seconds", round(so_far_s), round(max_s))
+                progress.tell(f"recorded {writer.count} samples, seconds elapsed", round(so_far_s), round(max_s))
             else:
                 if worker.state in OVER:
                     stopped = worker.reason
         except KeyboardInterrupt:
             if writer is None:
                 raise
-            stopped = "stopped by hand"
+            stopped = "stopped by Ctrl-C"
         if writer is None:
             why = worker.reason or "no data arrived"
-            raise worker.error or FatalError(f"sensor {s.driver}: no sample ({worker.state}: {why})")
+            raise worker.error or FatalError(f"the sensor {s.driver} delivered no samples ({worker.state}: {why})")
     summary = {"file": str(out), "samples": writer.count, "seconds": so_far_s, "stopped": stopped}
     return summary | {"holds": list(holds), "skipped": worker.stale_inputs}
 

@@ -12,11 +12,13 @@ def report(
     out: Annotated[Path, typer.Option(help="folder for index.html, report.json and the plots")] = Path("report"),
     pairs: Annotated[Path | None, typer.Option(help="folder of case files with your own stereo pairs")] = None,
     focal: Annotated[bool, typer.Option("--focal", help="also measure focal parallax through the layers")] = False,
-    model: Annotated[list[str] | None, typer.Option(help="ONNX file to compare as well; may be repeated")] = None,
+    model: Annotated[
+        list[str] | None, typer.Option(help="additional ONNX file to compare; repeat the option for more")
+    ] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="quick overview with quarter-size panels and fewer reference methods")
+        bool, typer.Option("--quick", help="measure only quarter-size panels and fewer reference methods")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print the result as one JSON object")] = False,
 ) -> None:
     """Measure every method's light PSNR and run time on this machine, and write a page with the results.
 
@@ -45,7 +47,7 @@ def report(
                 progress=tell,
             )
     except KeyboardInterrupt:
-        typer.echo(f"report: stopped; {out / 'index.html'} contains the measurements so far", err=True)
+        typer.echo(f"report: interrupted; the measurements so far are in {out / 'index.html'}", err=True)
         raise
     if as_json:
         print(to_json(record))
@@ -57,4 +59,4 @@ def report(
             f"{result['name']:18}{size:>11}{result['ms_p50']:10.1f} ms   "
             f"light {light:6.2f} dB, one ray {result['psnr_db']:6.2f} dB {result['memory_mib']:7.0f} MiB"
         )
-    print(f"see {out / 'index.html'}; quote the light PSNR, which assumes a tracking error of 1 mm")
+    print(f"see {out / 'index.html'} (quote the light PSNR, which assumes a tracking error of 1 mm)")

@@ -16,27 +16,31 @@ def run(
     config: Annotated[Path | None, typer.Option(help="configuration file; `phasestack config` prints one")] = None,
     replay: Annotated[
         str | None,
-        typer.Option(help="recording to play instead of the sensor; `demo` is the built-in one, which repeats"),
+        typer.Option(
+            help="recording to play instead of reading the sensor; `demo` plays the built-in recording in a loop"
+        ),
     ] = None,
     headless: Annotated[bool, typer.Option("--headless", help="render offscreen instead of opening windows")] = False,
     frames: Annotated[int | None, typer.Option(min=1, help="stop after this many refreshes")] = None,
     max_speed: Annotated[
         bool,
-        typer.Option("--max-speed", help="play a recording on a simulated clock, reproducibly and without waiting"),
+        typer.Option(
+            "--max-speed", help="play a recording as fast as possible on a simulated clock, with reproducible results"
+        ),
     ] = False,
     out: Annotated[Path | None, typer.Option(help="folder for pictures, frames.jsonl and summary.json")] = None,
     scene: Annotated[str | None, typer.Option(help="scene to show: a built-in name, a file or a folder")] = None,
     layout: Annotated[
-        str | None, typer.Option(help="arrangement of the views in pictures, as in content.layout")
+        str | None, typer.Option(help="arrangement of the views in pictures, like the setting content.layout")
     ] = None,
     model: Annotated[str | None, typer.Option(help="model to use: fast, balanced, best, sart or an ONNX file")] = None,
     scale: Annotated[float, number(0.05, 2.0, help="factor applied to the size of offscreen panels in pixels")] = 1.0,
     backend: Annotated[
         str | None,
-        typer.Option(help="device for everything except the network: cpu, gl or auto (the faster)"),
+        typer.Option(help="device for everything except the network: cpu, gl or auto, which takes the faster"),
     ] = None,
     keep_light: Annotated[
-        int, typer.Option(min=0, help="write the panels' layers to the --out folder every N refreshes (0: never)")
+        int, typer.Option(min=0, help="write the layers to the --out folder every N refreshes; 0 for never")
     ] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="print the summary as one JSON object")] = False,
 ) -> None:
@@ -55,7 +59,7 @@ def run(
     from runtime.errors import InputError
 
     if keep_light and out is None:
-        raise InputError("run", "--keep-light", "needs --out")
+        raise InputError("run", "--keep-light", "requires --out")
 
     def read_settings() -> Settings:
         settings = load_settings(config)

@@ -10,11 +10,13 @@ import typer
 
 def setup(
     config: Annotated[
-        Path, typer.Option(help="configuration file to create or change; the old one is backed up")
+        Path, typer.Option(help="configuration file to create or change; setup backs up the old file")
     ] = Path("phasestack.toml"),
-    out: Annotated[Path, typer.Option(help="folder for pairs, calibration, reports and setup.json")] = Path("setup"),
-    photos: Annotated[Path, typer.Option(help="folder with the photographs of the panels")] = Path("photos"),
-    simulate: Annotated[bool, typer.Option("--simulate", help="try the setup with a simulated display")] = False,
+    out: Annotated[Path, typer.Option(help="folder for point pairs, the calibration, reports and setup.json")] = Path(
+        "setup"
+    ),
+    photos: Annotated[Path, typer.Option(help="folder with your photographs of the panels")] = Path("photos"),
+    simulate: Annotated[bool, typer.Option("--simulate", help="try the setup on a simulated display")] = False,
     seed: Annotated[int, typer.Option(min=0, help="seed of the simulated display")] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="print the result as one JSON object at the end")] = False,
 ) -> None:

@@ -13,19 +13,25 @@ from runtime.support.ranges import FOV_RANGE_DEG
 
 def solve(
     left: Annotated[
-        Path, typer.Option(help="picture taken by a pinhole camera at the left eye that looks at the stack's origin")
+        Path, typer.Option(help="picture from a pinhole camera at the left eye, aimed at the stack's origin")
     ],
     panels: Annotated[Path, typer.Option(help="stack geometry: a TOML or JSON file with width_m, height_m and x_m")],
     out: Annotated[Path, typer.Option(help="folder to write the layers to")],
-    right: Annotated[Path | None, typer.Option(help="picture for the right eye; omit it if --left has both")] = None,
-    layout: Annotated[str | None, typer.Option(help="arrangement of the views in --left, as in content.layout")] = None,
+    right: Annotated[
+        Path | None, typer.Option(help="picture for the right eye; omit this option if --left contains both views")
+    ] = None,
+    layout: Annotated[
+        str | None, typer.Option(help="arrangement of the views in --left, like the setting content.layout")
+    ] = None,
     left_eye: Annotated[tuple[float, float, float] | None, place(help="left eye in the stack frame, in metres")] = None,
-    right_eye: Annotated[tuple[float, float, float] | None, place(help="right eye")] = None,
+    right_eye: Annotated[
+        tuple[float, float, float] | None, place(help="right eye in the stack frame, in metres")
+    ] = None,
     camera: Annotated[
         Path | None,
         typer.Option(
-            help="cameras that look elsewhere, in place of eyes and --fov: TOML or JSON with the 3x4 matrices `left` "
-            "and `right`, which map metres in the stack frame to pixels"
+            help="for cameras aimed elsewhere, instead of eyes and --fov: TOML or JSON file with 3x4 matrices `left` "
+            "and `right` that map metres in the stack frame to pixels"
         ),
     ] = None,
     fov: Annotated[
@@ -34,16 +40,18 @@ def solve(
     model: Annotated[str, typer.Option(help="model to use: fast, balanced, best, sart or an ONNX file")] = "balanced",
     repeat: Annotated[int, typer.Option(min=1, max=10000, help="number of timed runs after the warm-up")] = 1,
     eye_sigma_mm: Annotated[
-        float, number(0, 1000, "mm", help="tracking error to expect, in mm per axis; 1 for a good tracker")
+        float, number(0, 1000, "mm", help="expected tracking error per axis in mm (about 1 for a good tracker)")
     ] = 1.0,
     backend: Annotated[
         str | None,
-        typer.Option(help="device for everything except the network: cpu, gl or auto (timed if --repeat >= 10)"),
+        typer.Option(
+            help="device for everything except the network: cpu, gl or auto, which times both if --repeat >= 10"
+        ),
     ] = None,
     no_plan: Annotated[
-        bool, typer.Option("--no-plan", help="solve every pixel, even where the pictures make this unnecessary")
+        bool, typer.Option("--no-plan", help="solve every pixel, even where the pictures make it unnecessary")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print the content of solve.json")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print the contents of solve.json")] = False,
 ) -> None:
     """Compute the layers for two still pictures, and measure how well each eye sees its picture.
 
@@ -68,4 +76,4 @@ def solve(
     typer.echo(shown(result, as_json=as_json))
     if not as_json:
         typer.echo("quote light_db, which assumes a tracking error of 1 mm")
-        typer.echo(f"see {out / 'contact-sheet.png'} or, to look around, {out / 'viewer.html'}")
+        typer.echo(f"see {out / 'contact-sheet.png'}, or open {out / 'viewer.html'} to look around")

@@ -66,11 +66,13 @@ class Files:
         if self.right is None:
             return list(read_pair(self.left, with_options(Settings(), layout=self.layout).content))
         if self.layout is not None:
-            raise InputError("solve", "--layout", "requires one file with both views; omit --right")
+            raise InputError(
+                "solve", "--layout", "cannot be combined with --right; pass one file with both views as --left"
+            )
         pictures = [read_image(path) for path in (self.left, self.right)]
         if pictures[0].shape != pictures[1].shape:
             sizes = " and ".join(f"{p.shape[1]}x{p.shape[0]}" for p in pictures)
-            raise InputError(self.right, "size", f"the two pictures differ in size: {sizes}")
+            raise InputError(self.right, "size", f"the pictures must have the same size, but are {sizes}")
         return pictures
 
 
@@ -132,7 +134,7 @@ def solve_pair(
         try:
             done = timed(solve, runs=repeat)
         except EyesNotServed as error:  # permanent, because the eyes of a still pair do not move
-            why = f"{error}: {predictor.name} does not support these eye positions; try --model sart"
+            why = f"{predictor.name} does not support these eye positions ({error}); try --model sart"
             raise InputError("solve", "--left-eye, --right-eye", why) from None
         watch.lap("solve, warm-up included")
         with OutputFolder(out) as folder:
@@ -141,7 +143,7 @@ def solve_pair(
             try:
                 quality = seen.quality
             except ValueError as error:
-                why = f"the display is not visible from there: {error}"
+                why = f"this eye cannot see the display: {error}"
                 raise InputError("solve", "--left-eye", why) from None
             notes = disparity_doubts(pictures, eyes_m, stack, fov_deg=fov_deg, parallel=eyes.cameras is None)
             for note in notes:
@@ -188,10 +190,12 @@ def taken(pictures: list[Any], eyes: Eyes, stack: PanelStack) -> tuple[list[Any]
     """
     if eyes.cameras is None:
         if eyes.left is None or eyes.right is None:
-            raise InputError("solve", "--left-eye, --right-eye", "are required, in metres, unless --camera is given")
+            raise InputError(
+                "solve", "--left-eye, --right-eye", "are required without --camera; give both positions in metres"
+            )
         return pictures, checked_eyes(eyes.left, eyes.right, stack), eyes.fov_deg
     if eyes.left is not None or eyes.right is not None:
-        raise InputError("solve", "--camera", "already gives the eyes; omit --left-eye and --right-eye")
+        raise InputError("solve", "--camera", "already defines the eye positions; omit --left-eye and --right-eye")
     table = read_table(eyes.cameras)
     try:
         cameras, places_m = as_cameras([table.get("left"), table.get("right")])
@@ -210,7 +214,9 @@ def checked_eyes(left_eye: tuple[float, ...], right_eye: tuple[float, ...], stac
     for option, eye in (("--left-eye", left_eye), ("--right-eye", right_eye)):
         if eye[0] <= max(stack.x_m):
             raise InputError(
-                "solve", option, f"x = {eye[0]:g} m is not in front of the panels (x > {max(stack.x_m):g})"
+                "solve",
+                option,
+                f"x = {eye[0]:g} m is not in front of the panels; x must exceed {max(stack.x_m):g} m",
             )
     separation_m = math.dist(left_eye, right_eye)
     if separation_m < SEPARATION_MIN_M:

@@ -14,10 +14,11 @@ if TYPE_CHECKING:
 
 def stability(
     out: Annotated[Path | None, typer.Option(help="folder to write stability.json to")] = None,
-    full: Annotated[bool, typer.Option("--full", help="also run the long cases; takes minutes")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
+    full: Annotated[bool, typer.Option("--full", help="also run the long cases, which take minutes")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print the result as one JSON object")] = False,
     record: Annotated[
-        Path | None, typer.Option(help="record the errors as new limits in this file, after a model has changed")
+        Path | None,
+        typer.Option(help="save the measured errors as new limits in this file; use this after you change a model"),
     ] = None,
 ) -> None:
     """Run every numerical method on stiff and extreme cases and compare the results with references.
@@ -55,8 +56,8 @@ def stability(
         for case in failed:
             error = f"error {case.forward_error:.2g}, tolerance {case.tolerance:.2g} ({case.measure})"
             print(f"FAILS {case.stage}: {case.name}: {case.behaviour}, {error} {case.note}")
-        verdict = f"{len(failed)} of {len(cases)} cases fail" if failed else f"all {len(cases)} cases pass"
-        print(f"{verdict}, in {seconds:.0f} s" + (f"; see {out / 'stability.json'}" if out else ""))
+        verdict = f"{len(failed)} of {len(cases)} cases failed" if failed else f"all {len(cases)} cases passed"
+        print(f"{verdict} in {seconds:.0f} s" + (f"; see {out / 'stability.json'}" if out else ""))
     if failed:
         raise typer.Exit(1)
 

@@ -16,14 +16,18 @@ def try_(
     ] = None,
     scene: Annotated[str | None, typer.Option(help="scene to show: a built-in name, a file or a folder")] = None,
     layout: Annotated[
-        str | None, typer.Option(help="arrangement of the views in pictures, as in content.layout")
+        str | None, typer.Option(help="arrangement of the views in pictures, like the setting content.layout")
     ] = None,
     model: Annotated[str | None, typer.Option(help="model to use: fast, balanced, best, sart or an ONNX file")] = None,
     webcam: Annotated[bool, typer.Option("--webcam", help="track your head with a webcam of this PC")] = False,
     port: Annotated[int, typer.Option(min=0, max=65535, help="port to listen on; 0 picks a free one")] = 0,
-    no_browser: Annotated[bool, typer.Option("--no-browser", help="only print the address")] = False,
+    no_browser: Annotated[
+        bool, typer.Option("--no-browser", help="print the address without opening a browser")
+    ] = False,
     seconds: Annotated[float | None, number(1, 1e6, "s", help="stop after this many seconds")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help='print {"url": ...} as soon as the page is served')] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help='print {"url": ...} as soon as the page is available')
+    ] = False,
 ) -> None:
     """Try the display without hardware. Your browser shows what a viewer would see.
 

@@ -68,7 +68,7 @@ def try_display(settings: Settings, *, port: int, opens: bool, seconds: float | 
     def until() -> str:
         if link.wishes:
             return f"the page changed {', '.join(link.wishes)}"
-        return "the time is up" if time.monotonic() > ends_s else ""
+        return "reached the time limit" if time.monotonic() > ends_s else ""
 
     with tempfile.TemporaryDirectory(prefix="phasestack-") as folder:
         socket = Path(folder) / "status.sock"

@@ -35,7 +35,7 @@ def load_stack(path: Path, *, width_px: int, height_px: int) -> PanelStack:
     table = {"width_px": width_px, "height_px": height_px} | read_table(path)
     for name in ("width_m", "height_m", "x_m"):
         if name not in table:
-            hint = "; in a panels file it belongs at the top, not under [stack]" if "stack" in table else ""
+            hint = "; in a panels file, move it from [stack] to the top level" if "stack" in table else ""
             raise InputError(path, name, f"is missing{hint}")
     if not 2 <= len(table["x_m"] if isinstance(table["x_m"], list) else ()) <= PANELS_MOST:
         raise InputError(path, "x_m", f"must list 2 to {PANELS_MOST} panels")

@@ -35,24 +35,24 @@ class StackGeometry(Section):
     """The stack's geometry, from `--panels FILE` or a configuration's `[stack]` table."""
 
     width_m: Annotated[float, within(0.005, 20.0, "m")] = Field(
-        0.5184, description="width of every panel's active area in metres"
+        0.5184, description="width of each panel's active area in metres"
     )
     height_m: Annotated[float, within(0.005, 20.0, "m")] = Field(
-        0.2916, description="height of every panel's active area in metres"
+        0.2916, description="height of each panel's active area in metres"
     )
     x_m: Annotated[
         tuple[Annotated[float, within(-10.0, 10.0, "m")], ...], Field(min_length=2, max_length=PANELS_MOST)
     ] = Field((-0.06, 0.0, 0.06), description="positions of the panels along +x in metres, from rear to front")
-    width_px: Annotated[int, Field(ge=16, le=16384)] = Field(1920, description="width of every panel in pixels")
-    height_px: Annotated[int, Field(ge=16, le=16384)] = Field(1080, description="height of every panel in pixels")
+    width_px: Annotated[int, Field(ge=16, le=16384)] = Field(1920, description="width of each panel in pixels")
+    height_px: Annotated[int, Field(ge=16, le=16384)] = Field(1080, description="height of each panel in pixels")
     pixel_aspect: Annotated[float, within(0.1, 10.0, "")] = Field(
-        1.0, description="width of a pixel divided by its height; must match the sizes above to 3%"
+        1.0, description="width of a pixel divided by its height; must agree with the sizes above to within 3%"
     )
 
     tilt: Annotated[tuple[tuple[Slope, Slope], ...], Field(max_length=PANELS_MOST)] = Field(
         (),
-        description="slope of x on each panel, to the viewer's right and upwards, "
-        "as measured by `calibrate panels`; empty: parallel panels",
+        description="slope of x on each panel towards the viewer's right and upwards, as measured by "
+        "`calibrate panels`; leave empty if the panels are parallel",
     )
     registered_from_m: Point = Field(
         (0.5, 0.0, 0.0),
@@ -62,7 +62,7 @@ class StackGeometry(Section):
     @model_validator(mode="after")
     def _tilted(self) -> StackGeometry:
         if len(self.tilt) not in (0, len(self.x_m)):
-            raise ValueError(f"tilt: must have one entry per panel ({len(self.x_m)}), but has {len(self.tilt)}")
+            raise ValueError(f"tilt: must have {len(self.x_m)} entries, one per panel, but has {len(self.tilt)}")
         if any(any(slopes) for slopes in self.tilt) and self.registered_from_m[0] <= self.x_m[-1]:
             raise ValueError("registered_from_m: must be in front of the front panel")
         return self
@@ -83,8 +83,8 @@ class StackGeometry(Section):
             square_m = self.width_m / self.width_px * self.height_px / self.pixel_aspect
             raise ValueError(
                 f"stack.height_m: {self.width_px} x {self.height_px} pixels on {self.width_m:g} x {self.height_m:g} m "
-                f"are {aspect:.3g} times as wide as high, not {self.pixel_aspect:g}; did you mean "
-                f"height_m = {square_m:.4g}? (or set stack.pixel_aspect)"
+                f"have a pixel aspect of {aspect:.3g}, but stack.pixel_aspect is {self.pixel_aspect:g}; "
+                f"did you mean height_m = {square_m:.4g}? Otherwise change stack.pixel_aspect"
             )
 
     def stack(self) -> PanelStack:
@@ -101,22 +101,25 @@ class SensorSettings(Section):
     driver: str = Field(
         "replay", description="replay, openni2, realsense, usb-camera, fixed, or your own class as `module:Class`"
     )
-    source: str = Field("demo", description="what to open: a recording, `demo`, a serial number or a device URI")
-    timeout_s: Annotated[float, within(0.001, 600.0, "s")] = Field(
-        0.5, description="time without a sample after which the sensor counts as stalled"
+    source: str = Field(
+        "demo", description="recording, serial number or device URI to open, or `demo` for the built-in recording"
     )
-    loop: bool = Field(False, description="driver `replay`: restart the recording when it ends")
+    timeout_s: Annotated[float, within(0.001, 600.0, "s")] = Field(
+        0.5, description="time to wait for a sample before the sensor counts as stalled"
+    )
+    loop: bool = Field(False, description="for the driver `replay`: restart the recording when it ends")
     openni2_folder: PathText = Field(
-        "", description="driver `openni2`: folder with libOpenNI2.so and OpenNI2/Drivers; empty: search the system"
+        "",
+        description="for the driver `openni2`: folder with libOpenNI2.so and OpenNI2/Drivers; empty for the system's",
     )
     fov_deg: Annotated[float, Field(ge=0, lt=180)] = Field(
-        0.0, description="horizontal field of view of a camera that does not report it, such as a webcam; 0: unknown"
+        0.0, description="horizontal field of view of a camera that does not report one, such as a webcam; 0 if unknown"
     )
     fixed_eyes_m: tuple[Point, Point] | None = Field(
-        None, description="driver `fixed`: positions of the left and right eye in the stack frame"
+        None, description="for the driver `fixed`: positions of the left and right eye in the stack frame"
     )
     options: dict[str, Any] = Field(
-        default_factory=dict, description="options for your own driver, validated by its `Options` class"
+        default_factory=dict, description="options for your own driver; its `Options` class validates them"
     )
 
     @field_validator("source")
@@ -133,19 +136,21 @@ class TrackerSettings(Section):
 
     hold_s: Annotated[float, within(0.0, 60.0, "s")] = Field(
         0.5,
-        description="time to keep the last eye positions after losing the viewer, before the flat picture",
+        description="time to keep the last eye positions after losing the viewer, before showing the flat picture",
     )
     noise_m: Annotated[float, within(1e-6, 0.2, "m")] = Field(
-        0.003, description="standard deviation per axis of a measured eye, for sensors that do not report it"
+        0.003, description="standard deviation per axis of a measured eye position, for sensors that do not report it"
     )
 
 
 class CalibrationSettings(Section):
     """Calibration that maps the sensor frame to the stack frame, and the viewing range."""
 
-    file: PathText = Field("", description="calibration file (TOML); empty: the demo recording's")
+    file: PathText = Field(
+        "", description="calibration file (TOML); leave empty to use the demo recording's calibration"
+    )
     ipd_m: Annotated[float, within(0.04, 0.08, "m", zero=True)] = Field(
-        0.0, description="viewer's eye separation, for calibration charts and cameras without depth; 0: unknown"
+        0.0, description="viewer's eye separation, for calibration charts and cameras without depth; 0 if unknown"
     )
     viewing_m: tuple[Annotated[float, within(0.05, 20.0, "m")], Annotated[float, within(0.05, 20.0, "m")]] = Field(
         (0.4, 0.6),
@@ -161,10 +166,12 @@ class CalibrationSettings(Section):
     @model_validator(mode="after")
     def _viewing(self) -> CalibrationSettings:
         if self.viewing_m[1] < self.viewing_m[0] * 1.1:
-            raise ValueError("viewing_m: must be the nearest and the farthest distance, which is at least 10% larger")
+            raise ValueError("viewing_m: must be two distances, the nearest first, which differ by at least 10%")
         low, high = self.viewing_up_deg
         if not (-40 <= low < high <= 40 and high - low >= 2):
-            raise ValueError("viewing_up_deg: must be the lowest and highest angle, from -40 to 40, at least 2 apart")
+            raise ValueError(
+                "viewing_up_deg: must be two angles from -40 to 40 degrees, at least 2 degrees apart, the lower first"
+            )
         return self
 
 
@@ -180,54 +187,56 @@ class ContentSettings(Section):
         "demo", description="a built-in scene, a preset, a file, a folder, or your own class as `module:Class`"
     )
     options: dict[str, Any] = Field(
-        default_factory=dict, description="options for a scene that is a class; the scene `program` takes `port`"
+        default_factory=dict, description="options for a scene that is a class; the scene `program` accepts `port`"
     )
     fov_deg: Annotated[float, within(*FOV_RANGE_DEG, "degrees")] = Field(
         40.0, description="horizontal field of view of the eyes' images"
     )
     background: tuple[Unit, Unit, Unit] | None = Field(
-        None, description="RGB colour behind the scene, 0-1; unset: dark, or white for built-in scenes"
+        None, description="RGB colour behind the scene, 0 to 1 each; the default is dark, or white for built-in scenes"
     )
-    file: PathText = Field("", description="data of a preset: a .ply file, a .glb file or the folder of a data set")
+    file: PathText = Field("", description="data for a preset: a .ply file, a .glb file or the folder of a data set")
     layout: Annotated[str, Field(pattern=LAYOUT)] = Field(
         "auto",
         description="arrangement of the views: mono, [half-]side-by-side, [half-]top-bottom, [half-]cross-eyed (right "
-        "view on the left), anaglyph, rgbd or a quilt such as qs8x6a0.75; auto: by file name",
+        "view on the left), anaglyph, rgbd or a quilt such as qs8x6a0.75; auto goes by the file name",
     )
     cone_deg: Annotated[float, Field(gt=0, lt=180)] = Field(40.0, description="angle between a quilt's outermost views")
     depth_m: tuple[Annotated[float, within(-10.0, 10.0, "m")], Annotated[float, within(-10.0, 10.0, "m")]] = Field(
         (-0.05, 0.05),
-        description="depth range (rear, front) of an RGBD picture; a mesh scaled by `fit` may be up to twice as deep",
+        description="depth range (rear, front) of an RGBD picture; `fit` scales meshes to at most twice this depth",
     )
     picture_rate_hz: Annotated[float, within(0.01, 1000.0, "Hz")] = Field(
         30.0, description="frame rate of a folder of pictures"
     )
-    fit: bool = Field(True, description="scale and centre a mesh or splat, unless from a preset, to fit the display")
+    fit: bool = Field(
+        True, description="scale and centre a mesh or splat to fit the display, unless it comes from a preset"
+    )
     axes: Annotated[str, Field(pattern=r"^(auto|[+-][xyz] [+-][xyz])$")] = Field(
         "auto",
         description="axes of a mesh or splat that point up and towards the viewer, such as `+z -y`; "
-        "auto: glTF's convention, or guessed from the extent for other files",
+        "auto follows glTF's convention and guesses from the extent of other files",
     )
-    library: PathText = Field("", description="folder of pictures, films, models and playlists offered on the page")
+    library: PathText = Field("", description="folder of pictures, films, models and playlists to offer on the page")
     scale: Annotated[float, within(0.001, 1000.0, "")] = Field(
         1.0, description="scale factor of the scene about the display's centre"
     )
     offset_m: tuple[Offset, Offset, Offset] = Field(
-        (0.0, 0.0, 0.0), description="displacement of the scene in metres: out of the screen, to the right, up"
+        (0.0, 0.0, 0.0), description="offset of the scene in metres: out of the screen, to the right, up"
     )
     rotation_deg: tuple[Turn, Turn, Turn] = Field(
         (0.0, 0.0, 0.0),
         description="rotations of the scene about the axes out of the screen, right and up, applied in this order",
     )
-    turntable_per_min: Annotated[float, within(-600.0, 600.0, "turns a minute")] = Field(
+    turntable_per_min: Annotated[float, within(-600.0, 600.0, "turns per minute")] = Field(
         0.0,
-        description="rotation speed about the vertical axis in turns per minute; negative: clockwise from above",
+        description="rotation speed about the vertical axis in turns per minute; negative is clockwise seen from above",
     )
 
     @model_validator(mode="after")
     def _ordered(self) -> ContentSettings:
         if self.depth_m[0] >= self.depth_m[1]:
-            raise ValueError("depth_m: must be the rear and the front limit, in this order")
+            raise ValueError("depth_m: must be the rear limit followed by the front limit")
         if self.axes != "auto" and self.axes[1] == self.axes[4]:
             raise ValueError("axes: must name two different axes")
         return self
@@ -241,11 +250,13 @@ def _accept_legacy_backend(name: Any) -> Any:
 class ModelSettings(Section):
     """The model, and the device to run it on."""
 
-    name: NameOrPath = Field("balanced", description="fast, balanced, best, sart, or an ONNX file with our contract")
+    name: NameOrPath = Field(
+        "balanced", description="fast, balanced, best, sart, or an ONNX file exported by phasestack"
+    )
     effort: Literal["auto", "full"] = Field(
         "auto",
-        description="resolution and number of steps of each solution: auto (adapted to the viewer's movement) or full "
-        "(always the panels' resolution and all of the model's steps)",
+        description="resolution and number of steps of each solution: auto adapts both to the viewer's movement; full "
+        "always uses the panels' resolution and all of the model's steps",
     )
     provider: Literal["cpu", "cuda", "tensorrt", "openvino"] = Field(
         "cpu", description="ONNX Runtime execution provider for the network"
@@ -253,17 +264,19 @@ class ModelSettings(Section):
     backend: Annotated[Literal["auto", "cpu", "gl"], BeforeValidator(_accept_legacy_backend)] = Field(
         "auto",
         description="device for everything except the network: cpu, gl (the GPU through OpenGL) "
-        "or auto (the faster of the two, measured at the start)",
+        "or auto, which measures both at the start and takes the faster",
     )
-    threads: Annotated[int, Field(ge=0, le=256)] = Field(2, description="number of inference threads; 0: one per core")
+    threads: Annotated[int, Field(ge=0, le=256)] = Field(
+        2, description="number of inference threads; 0 starts one per core"
+    )
     eye_sigma_mm: Literal["auto"] | NonNegative = Field(
         "auto",
         description="tracking error that solutions allow for: standard deviation of both eyes' common position "
-        "in mm per axis; 0: none; auto: as the tracker reports",
+        "in mm per axis, 0 for none, or auto for what the tracker reports",
     )
     budget_ms: NonNegative = Field(
         0.0,
-        description="time, including drawing, after which a solution begins no further step; 0: no limit",
+        description="time, including drawing, after which a solution starts no further step; 0 sets no limit",
     )
 
 
@@ -271,22 +284,30 @@ class PanelSettings(Section):
     """One physical panel: its monitor, mounting and grey curve."""
 
     edid_serial: str = Field("", description="EDID serial number of the panel's monitor")
-    connector: str = Field("", description="connector of the monitor, such as HDMI-1; if both are set, both must match")
+    connector: str = Field(
+        "", description="connector of the monitor, such as HDMI-1; if edid_serial is also set, both must match"
+    )
     rotation_deg: Literal[0, 90, 180, 270] = Field(0, description="counter-clockwise rotation of the panel as mounted")
-    mirror: Literal["none", "horizontal", "vertical"] = Field("none", description="mirroring, applied before rotation")
+    mirror: Literal["none", "horizontal", "vertical"] = Field(
+        "none", description="mirroring of the panel, applied before rotation"
+    )
     homography: tuple[tuple[Entry, Entry, Entry], tuple[Entry, Entry, Entry], tuple[Entry, Entry, Entry]] = Field(
         ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
         description="3x3 matrix from ideal to actual panel pixels, from `calibrate panels`",
     )
-    lut: PathText = Field("", description="CSV file of phase (0-1) and grey (0-1) per channel; empty: use `gamma`")
-    gamma: Annotated[float, within(0.1, 10.0, "")] = Field(1.0, description="without a LUT, grey = phase^(1/gamma)")
+    lut: PathText = Field(
+        "", description="CSV file of phase (0-1) and grey (0-1) per channel; leave empty to use `gamma`"
+    )
+    gamma: Annotated[float, within(0.1, 10.0, "")] = Field(
+        1.0, description="used without a LUT: grey = phase^(1/gamma)"
+    )
 
 
 class OutputSettings(Section):
     """Output to the panels."""
 
     kind: Literal["offscreen", "windows"] = Field(
-        "offscreen", description="offscreen (no windows) or windows (one fullscreen window per panel)"
+        "offscreen", description="offscreen for no windows, or windows for one fullscreen window per panel"
     )
     panels: tuple[PanelSettings, ...] = Field(
         (), max_length=PANELS_MOST, description="one table per panel, from rear to front"
@@ -330,7 +351,7 @@ class LoopSettings(Section):
     )
     evaluate_every: Annotated[int, Field(ge=0)] = Field(
         20,
-        description="with --out: measure quality every N refreshes (less often in real time); 0: only at the last one",
+        description="with --out: measure quality every N refreshes, less often in real time; 0 for only the last one",
     )
 
 
@@ -349,7 +370,7 @@ class ServiceSettings(Section):
 
     socket: PathText = Field("/run/phasestack/status.sock", description="path of the status and control socket")
     blackbox_minutes: Annotated[float, within(0.0, 60.0, "min")] = Field(
-        2.0, description="length of the black box's history in memory, in minutes; 0: off"
+        2.0, description="minutes of history that the black box keeps in memory; 0 turns it off"
     )
 
 

@@ -27,7 +27,9 @@ def clip_from_stack(view: View, corners_m: F64) -> F64:
     """
     near_m, far_m = depth_bounds(view, corners_m)
     if not 0.0 < near_m < far_m:
-        raise ValueError(f"near {near_m} and far {far_m} do not bound a view")
+        raise ValueError(
+            f"near {near_m} and far {far_m} are not valid clipping distances; far must be greater than near"
+        )
     u, v, w = view.pixels_from_stack
     span = far_m - near_m
     depth = w * ((far_m + near_m) / span) + np.array([0.0, 0.0, 0.0, -2.0 * far_m * near_m / span])

@@ -49,7 +49,7 @@ def load_compressed_splats(path: Path) -> Gaussians:
         raise
     except Exception:  # zlib, zipfile and zstandard raise various errors, as does malformed JSON
         kind = "an SPZ" if path.suffix.lower() == ".spz" else "a SOG"
-        raise InputError(path, "", f"is damaged, or not {kind} file") from None
+        raise InputError(path, "", f"is damaged or is not {kind} file") from None
 
 
 def _spz(path: Path) -> Gaussians:
@@ -74,7 +74,7 @@ def _spz(path: Path) -> Gaussians:
     else:
         blocks = _zstd_blocks(data, table, sizes)
     if [len(block) for block in blocks] != sizes:
-        raise InputError(path, "", f"is cut off: its header declares {count:,} splats")
+        raise InputError(path, "", f"is truncated: the header declares {count:,} splats")
     places, alphas, colours, scales, turns, higher = (np.frombuffer(block, np.uint8) for block in blocks)
     flat = np.asarray((colours.reshape(count, 1, 3) / np.float32(255) - np.float32(0.5)) / SPZ_COLOUR, np.float32)
     return drawable(
@@ -140,7 +140,7 @@ def _sog(path: Path) -> Gaussians:
         meta = untrusted_input.parsed_json(files.read("meta.json"), source=path)
         if meta.get("version") != 2:
             version = untrusted_input.shown(meta.get("version", 1))
-            raise InputError(path, "meta.json", f"is SOG version {version}; only version 2 is supported")
+            raise InputError(path, "meta.json", f"has SOG version {version}, but only version 2 is supported")
         count = int(meta["count"])
         untrusted_input.within(count, LIMITS.splats, source=path, field="splats")
         low, high, scales, turns, flat = (
@@ -158,7 +158,7 @@ def _sog(path: Path) -> Gaussians:
             higher = np.array(more["codebook"], np.float32)[entries[label]]
             harmonics = with_higher(harmonics, higher[:, :MOST])
     if 3 * (harmonics.shape[1] - 1) not in COEFFICIENTS:
-        raise InputError(path, "shN", "contains no harmonics of degree 1 to 3")
+        raise InputError(path, "shN", "does not contain harmonics of degree 1 to 3")
     three = (turns[:, :3] / np.float32(255) - np.float32(0.5)) * np.float32(np.sqrt(2))
     return drawable(
         path,
@@ -203,5 +203,5 @@ class _SogFiles:
         """Return a picture's first `count` pixels (count, 4). Raises InputError if it has fewer."""
         pixels = self.picture(name).reshape(-1, 4)[:count]
         if len(pixels) < count:
-            raise InputError(self._path, untrusted_input.shown(name), f"has {len(pixels)} of {count} pixels")
+            raise InputError(self._path, untrusted_input.shown(name), f"has only {len(pixels)} of the {count} pixels")
         return pixels

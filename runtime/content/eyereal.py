@@ -68,22 +68,24 @@ def read_folder(folder: Path, preset: str) -> tuple[Pair, ...]:
             continue
         eye = (stack_from_scene @ [float(match[2]), float(match[3]), float(match[4]), 1.0])[:3]
         if eye[0] <= 0:
-            problem = f"its eye is behind the display (x = {eye[0]:.3f} m) with preset {preset}"
+            problem = f"places the eye behind the display (x = {eye[0]:.3f} m) with the preset {preset}"
             raise InputError(path, "name", problem)
         files.setdefault(int(match[1]), []).append((match[5].lower(), path, eye))
     if not files:
-        raise InputError(folder, "", "contains no pair0_x.._y.._z.._0.jpg")
+        raise InputError(folder, "", "contains no pictures named like pair0_x.._y.._z.._0.jpg")
     pairs = []
     for number, halves in sorted(files.items()):
         names = [half for half, _, _ in halves]
         if sorted(names) not in (["0", "1"], ["left", "right"]):
-            problem = f"has {', '.join(f'_{half}' for half in names)}; _0 and _1, or _left and _right are needed"
+            problem = f"has {', '.join(f'_{half}' for half in names)}, but needs either _0 and _1, or _left and _right"
             raise InputError(halves[0][1], f"pair{number}", problem)
         (name, left, left_eye), (_, right, right_eye) = sorted(halves, key=lambda half: half[2][1])
         if left_eye[1] == right_eye[1]:
-            raise InputError(left, f"pair{number}", "both eyes have the same y, so it is unclear which one is the left")
+            raise InputError(
+                left, f"pair{number}", "both eyes have the same y, so the left eye cannot be told from the right eye"
+            )
         if name == "right":
-            raise InputError(right, f"pair{number}", f"_left is to the right of _right with preset {preset}")
+            raise InputError(right, f"pair{number}", f"_left is to the right of _right with the preset {preset}")
         pairs.append(Pair(number, (left, right), np.array([left_eye, right_eye]), stack_from_scene[:3, 3]))
     return tuple(pairs)
 
@@ -97,7 +99,9 @@ def prepare(file: SceneFile) -> Callable[..., ContentSource]:
     path, settings = file.path, file.settings
     name = file.preset or next((name for name in preset_names() if name in path.resolve().name), "")
     if not name:
-        raise InputError(path, "name", "names no preset: set content.scene to a preset and content.file to this folder")
+        raise InputError(
+            path, "name", "contains no preset's name; set content.scene to a preset and content.file to this folder"
+        )
     pairs = read_folder(path, name)
     background = settings.background or WHITE
     make = partial(EyeRealSource, pairs, fov_deg=settings.fov_deg, background=background, name=name)

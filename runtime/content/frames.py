@@ -97,7 +97,7 @@ class PictureFiles(Frames):
                 progress.tell(f"{path.parent.name}: pictures", number, len(paths))
             try:
                 if folder is not None and path.suffix.lower() in VIDEOS:
-                    raise InputError(path, "", "is a film: set content.scene to the film itself")
+                    raise InputError(path, "", "is a film; set content.scene to the film itself")
                 header = header_of_file(path)  # decoding every picture would take too long
             except InputError as error:
                 refused.append(error)
@@ -108,7 +108,7 @@ class PictureFiles(Frames):
             raise refused[0]
         if refused:
             some = "; ".join(f"{Path(error.source).name} {error.problem}" for error in refused[:TOLD])
-            log.warning("%s: %d of %d pictures are skipped: %s", folder, len(refused), len(paths), some)
+            log.warning("%s: skipping %d of %d pictures: %s", folder, len(refused), len(paths), some)
         self._held = -1, np.empty((0, 0, 3), np.uint8)
         self._held = 0, self._read(0)
         self.count, self.rate_hz = len(self._paths), settings.picture_rate_hz
@@ -153,11 +153,11 @@ class Video(Frames):
         self._path, self.layouts = path, [layout]
         self._capture = open_film(path)
         if not self._capture.isOpened():
-            raise InputError(path, "", "is not a video that can be decoded")
+            raise InputError(path, "", "cannot be decoded as a film")
         try:
             count, self.rate_hz, width, height = (float(self._capture.get(key)) for key in VIDEO_PROPERTIES)
             if not (1 <= count <= VIDEO_FRAMES_MAX and 0.1 < self.rate_hz < 1000):
-                raise InputError(path, "frames", f"{count:g} at {self.rate_hz:g} Hz cannot be played")
+                raise InputError(path, "frames", f"a film of {count:g} frames at {self.rate_hz:g} Hz cannot be played")
             check_size(round(width), round(height), source=path)
         except BaseException:
             self._capture.release()
@@ -228,15 +228,15 @@ def open_frames(path: Path, settings: ContentSettings) -> Frames:
 def _suggest(path: Path, picture: U8) -> None:
     """Log a hint if a picture shown as a single view probably contains several."""
     if "quilt" in path.stem.lower():
-        log.warning("%s: if it is a quilt, pass --layout qs8x6a0.75 (columns, rows, aspect ratio of a view)", path)
+        log.warning("%s: if this picture is a quilt, pass --layout qs8x6a0.75 (columns, rows, view aspect)", path)
     elif found := hint(picture):
-        log.warning("%s: its halves nearly agree; if they are two views, pass --layout %s", path, found)
+        log.warning("%s: the halves are almost the same; if they are two views, pass --layout %s", path, found)
 
 
 def _open_film(path: Path, settings: ContentSettings) -> Video:
     stated = film_header(path)
     if stated.left_out and settings.layout == "auto":
-        log.warning("%s: is shown without %s", path, stated.left_out)
+        log.warning("%s: showing the film without %s", path, stated.left_out)
     layout = layout_of(path, settings, stated=stated.layout)
     video = Video(path, replace(layout, span_deg=stated.span_deg or layout.span_deg))
     if settings.layout == "auto":
@@ -249,10 +249,10 @@ def _why_none(folder: Path) -> str:
     """Return an error message that explains why no pictures were found in a folder."""
     if problem := camera_set_in(folder):
         return problem
-    message = "the folder holds no pictures"
+    message = "the folder contains no pictures"
     for inner in sorted(item for item in folder.iterdir() if item.is_dir()):
         if any(item.suffix.lower() in PICTURES for item in inner.iterdir()):
-            return f"{message}; those in {inner.name} are shown by its own name"
+            return f"{message}; to show the pictures in {inner.name}, name that folder instead"
     return message
 
 
@@ -268,7 +268,9 @@ def read_pair(path: Path, settings: ContentSettings) -> list[U8]:
     layout = layout_of(path, settings, stated=header_of_file(path).layout)
     views = layout.views(views[0])
     if len(views) != 2:
-        raise InputError(path, "layout", f"holds {len(views)} view{'s' * (len(views) > 1)}: give --right, or --layout")
+        raise InputError(
+            path, "layout", f"contains {len(views)} view{'s' * (len(views) > 1)}; pass --right or another --layout"
+        )
     height, width = views[0].shape[:2]
     aspect = layout.pixel_aspect(width_px=width, height_px=height)
     size = (round(width * max(aspect, 1)), round(height / min(aspect, 1)))

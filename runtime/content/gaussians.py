@@ -72,16 +72,16 @@ def load_gaussians(header: PlyHeader) -> Gaussians:
     """
     path, table = header.path, read_elements(header)["vertex"]
     if not len(table):
-        raise InputError(path, "vertex", "the file has none")
+        raise InputError(path, "vertex", "the file contains no splats")
     names = set(table.dtype.names or ())
     rest = sum(name.startswith("f_rest_") for name in names)
     if rest not in COEFFICIENTS:
-        raise InputError(path, "f_rest", f"{rest} properties; 0, 9, 24 or 45 are needed")
+        raise InputError(path, "f_rest", f"the file has {rest} such properties, but must have 0, 9, 24 or 45")
 
     def columns(*wanted: str) -> F32:
         """Return the named properties as columns of an array."""
         if missing := [name for name in wanted if name not in names]:
-            raise InputError(path, missing[0], "the property is missing: not a 3D Gaussian splat file")
+            raise InputError(path, missing[0], "the property is missing, so this is not a 3D Gaussian splat file")
         with np.errstate(over="ignore"):  # doubles beyond float32's range become infinite
             return np.column_stack([table[name] for name in wanted]).astype(np.float32)
 
@@ -126,7 +126,7 @@ def drawable(path: Path, *, centres: F32, log_scales: F32, quaternions: F32, log
         # The logarithm may be minus infinity, which trainers write for a disc's thickness.
         usable &= (log_scales < np.log(LARGEST_RELATIVE_SCALE * (extent or 1.0))).all(1)
     if not usable.all():
-        log.warning("%s: is drawn without %d of its %d splats, which are unusable", path, (~usable).sum(), len(usable))
+        log.warning("%s: ignoring %d of %d splats because they are not usable", path, (~usable).sum(), len(usable))
         centres, log_scales, quaternions = centres[usable], log_scales[usable], quaternions[usable]
         logits, harmonics = logits[usable], harmonics[usable]
     opacities = np.asarray(expit(logits.astype(np.float64)), dtype=np.float32)

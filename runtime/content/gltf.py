@@ -63,7 +63,7 @@ class GltfScene:
             self._check()
             self._read()
         except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-            raise InputError(path, "", f"is damaged, or not glTF ({_problem(error)})") from None
+            raise InputError(path, "", f"is damaged or is not glTF: {_problem(error)}") from None
 
     def _check(self) -> None:
         file, path = self.file, self.path
@@ -238,14 +238,14 @@ class GltfScene:
             accessors = [self.file.item("accessors", index) for index in primitive["attributes"].values()]
             if all("bufferView" in accessor for accessor in accessors):  # the file also contains the data uncompressed
                 return {}, None
-            problem = f"Draco needs `pip install 'phasestack[draco]'`; or {WAY_OUT}"
+            problem = f"reading Draco requires `pip install 'phasestack[draco]'`; otherwise {WAY_OUT}"
             raise InputError(self.path, DRACO, problem) from None
         try:
             decoded = DracoPy.decode(bytes(self.file.view(own["bufferView"])[0]))
         except InputError as error:
             raise InputError(self.path, DRACO, error.problem) from None
         except DracoPy.FileTypeException:
-            raise InputError(self.path, DRACO, "is damaged: its bytes cannot be decoded") from None
+            raise InputError(self.path, DRACO, "is damaged and cannot be decoded") from None
         arrays = {attribute["unique_id"]: attribute["data"] for attribute in decoded.attributes}
         values = {}
         for name, number in own["attributes"].items():
@@ -270,7 +270,7 @@ class GltfScene:
         uses = base.get(f"{prefix}Texture"), material.get("emissiveTexture") if glow != BLACK else None
         use: Table = uses[0] or uses[1] or {}
         if uses[0] and uses[1] and _coordinates(uses[0]) != _coordinates(uses[1]):
-            self.left_out.add("an emissive texture with separate coordinates")
+            self.left_out.add("an emissive texture with its own coordinates")
             uses, glow = (uses[0], None), BLACK
         textures = [None if used is None else file.item("textures", used["index"]) for used in uses]
         pictures = [None if texture is None else file.picture(texture) for texture in textures]
@@ -297,9 +297,9 @@ def _problem(error: Exception) -> str:
     if isinstance(error, KeyError):
         return f"{untrusted_input.shown(str(error))} is missing"
     if isinstance(error, IndexError):
-        return "a reference to a missing object"
+        return "a reference points to a missing object"
     own = isinstance(error, ValueError) and error.args and str(error.args[0]).startswith(OWN_PROBLEMS)
-    return one_line(str(error), most=120) if own else "a value of a wrong kind"
+    return one_line(str(error), most=120) if own else "a value has the wrong type"
 
 
 def _local(node: Table) -> F64:
@@ -334,7 +334,7 @@ def _faces(corners: Array, mode: int) -> Array:
         return corners[np.column_stack([number, number + 1 + number % 2, number + 2 - number % 2])]
     if mode == FAN:
         return corners[np.column_stack([number + 1, number + 2, np.zeros_like(number)])]
-    raise ValueError(f"a primitive's mode is {mode}")
+    raise ValueError(f"a primitive has the unsupported mode {mode}")
 
 
 def _coordinates(use: Table) -> tuple[int, Table]:

@@ -39,7 +39,7 @@ COMPRESSED = {
     "KHR_meshopt_compression": "meshopt",
     "KHR_texture_basisu": "KTX2",
 }
-WAY_OUT = "save it without that compression, in Blender or with `gltf-transform`"
+WAY_OUT = "save the model without that compression, with Blender or `gltf-transform`"
 
 
 class GltfFile:
@@ -137,7 +137,7 @@ class GltfFile:
     def _without_data(self, number: int, buffer: Table) -> bytes:
         if any(name in buffer.get("extensions", {}) for name in COMPRESSED):
             raise InputError(self.path, f"buffers[{number}]", f"is compressed with meshopt; {WAY_OUT}")
-        raise InputError(self.path, f"buffers[{number}].uri", "is missing: the file is incomplete")
+        raise InputError(self.path, f"buffers[{number}].uri", "is missing, so the file is incomplete")
 
     def _of_uri(self, uri: str) -> bytes:
         if not uri.startswith("data:"):
@@ -148,7 +148,7 @@ class GltfFile:
         try:
             return base64.b64decode(coded)
         except binascii.Error as error:
-            raise ValueError(f"a data URI that is not base64: {error}") from None
+            raise ValueError(f"a data URI is not base64: {error}") from None
 
     def picture(self, texture: Table) -> U8:
         """Return a texture's picture as an RGBA array (h, w, 4).
@@ -216,10 +216,10 @@ def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes]:
         raise InputError(path, "asset.version", VERSION_1)
     size = int.from_bytes(data[12:16], "little")
     if data[16:20] != b"JSON" or len(data) < 20 + size:
-        raise InputError(path, "", "is cut off, or malformed: a GLB file begins with a chunk of JSON")
+        raise InputError(path, "", "is truncated or malformed: a GLB file must begin with a JSON chunk")
     return data[20 : 20 + size], data[20 + size + 8 :]
 
 
 VERSION_1 = (
-    "is 1.0, which is not supported; convert it to glTF 2.0, with `gltf-pipeline -i old.gltf -o new.glb` or Blender"
+    "is 1.0, which is not supported; convert it to glTF 2.0 with Blender or `gltf-pipeline -i old.gltf -o new.glb`"
 )

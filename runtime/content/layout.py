@@ -78,7 +78,9 @@ class Layout:
         """
         height, width = picture.shape[:2]
         if not 0 < self.columns <= width or not 0 < self.rows <= height:
-            raise ValueError(f"{width} x {height} pixels cannot hold {self.columns} x {self.rows} views")
+            raise ValueError(
+                f"a picture of {width} x {height} pixels cannot contain {self.columns} x {self.rows} views"
+            )
         if self.kind == "anaglyph":  # the left eye's view is red, the right eye's view is cyan
             cyan = cv2.addWeighted(picture[..., 1], 0.8, picture[..., 2], 0.2, 0)
             return [np.repeat(np.asarray(part)[..., None], 3, axis=2) for part in (picture[..., 0], cyan)]
@@ -123,7 +125,7 @@ def layout_of(path: Path, settings: ContentSettings, *, stated: str = "") -> Lay
         if not columns or not rows:
             raise InputError(path, "layout", f"a quilt cannot have {columns} x {rows} views")
         if aspect and not ASPECT_MIN <= aspect <= ASPECT_MAX:
-            problem = f"the aspect ratio is {aspect:g}; it must be {ASPECT_MIN:g} to {ASPECT_MAX:g}"
+            problem = f"the aspect ratio of a view must be from {ASPECT_MIN:g} to {ASPECT_MAX:g}, not {aspect:g}"
             raise InputError(path, "layout", problem)
         return Layout("quilt", columns, rows, view_aspect=aspect)
     kind = named.removeprefix("half-").replace("cross-eyed", "side-by-side")

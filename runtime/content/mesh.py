@@ -53,7 +53,7 @@ def prepare(file: SceneFile) -> Callable[..., ContentSource]:
     """
     data = load_mesh(file.path)
     if data.left_out:
-        log.warning("%s: is drawn without %s", file.path, ", ".join(data.left_out))
+        log.warning("%s: not drawing %s", file.path, ", ".join(data.left_out))
     info = ContentInfo(file.path.stem, background=file.background, left_out=data.left_out)
     matrix = file.placed(data.low, data.high, facing=data.facing)
     if not data.parts:
@@ -107,7 +107,7 @@ def load_mesh(path: Path) -> MeshData:
             normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
             total, area = total + normal.sum(0), area + float(np.linalg.norm(normal, axis=1).sum())
     if parts and not area:
-        raise InputError(path, "faces", "all have zero area")
+        raise InputError(path, "faces", "all faces have zero area")
     low, high = (np.asarray(end([end(place, 0) for place in places], 0), np.float64) for end in (np.min, np.max))
     said = tuple(untrusted_input.shown(name) for name in sorted(left_out))
     return MeshData(tuple(parts), tuple(points), low, high, total / (area or 1.0), said)
@@ -141,7 +141,7 @@ def _file_of(uri: str, *, source: Path, field: str) -> Path:
     """
     shown = untrusted_input.shown(uri, most=200)
     if "://" in uri or uri.startswith("data:"):
-        raise InputError(source, field, f"{shown}: only files next to this one are read")
+        raise InputError(source, field, f"{shown} is not a file next to this one; only such files are read")
     name = untrusted_input.checked_path(unquote(uri), source=source, field=field)
     if name.is_absolute():
         raise InputError(source, field, f"{shown} is an absolute path; only files next to this one are read")
@@ -153,16 +153,16 @@ def _file_of(uri: str, *, source: Path, field: str) -> Path:
 def _check(path: Path, parts: Sequence[Part], places: Sequence[F32], left_out: set[str]) -> None:
     """Raise InputError if there is nothing to draw, or if any coordinate is not finite or too large."""
     if not any(len(place) for place in places):
-        alone = f", and {' and '.join(sorted(left_out))} are not drawn" if left_out else ""
-        raise InputError(path, "faces", f"the file has none{alone}")
+        alone = f", and {' and '.join(sorted(left_out))} are not supported" if left_out else ""
+        raise InputError(path, "faces", f"the file contains no faces{alone}")
     for points in places:
         broken = int((~(np.abs(points) <= LARGEST_COORDINATE).all(1)).sum())  # also counts NaN
         if broken:
-            problem = f"{broken} of {len(points)} are not finite, or beyond {LARGEST_COORDINATE:g}"
+            problem = f"{broken} of {len(points)} vertices are not finite or exceed {LARGEST_COORDINATE:g}"
             raise InputError(path, "vertices", problem)
     for part in parts:
         if not np.isfinite(part.shape.uv).all():
-            raise InputError(path, "texture coordinates", "are not all finite")
+            raise InputError(path, "texture coordinates", "some texture coordinates are not finite")
 
 
 def _check_counts(path: Path, data: bytes) -> None:

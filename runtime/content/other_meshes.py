@@ -53,7 +53,7 @@ class FolderResolver(trimesh.resolvers.FilePathResolver):
             if file_name is None:
                 what = "materials" if is_material else "texture"
                 why = f"{untrusted_input.shown(name)} does not exist"
-                log.warning("%s: is drawn grey without its %s (%s)", self._path, what, why)
+                log.warning("%s: drawing the mesh in grey without its %s because %s", self._path, what, why)
                 self.has_materials = self.has_materials and not is_material
                 return b"" if is_material else _grey()
             data = self._read(file_name)
@@ -116,7 +116,7 @@ def read_mesh(path: Path, data: bytes, read: Read) -> tuple[list[Part], list[tup
         why = (
             "a face names a vertex that does not exist"
             if isinstance(error, IndexError)
-            else "it is damaged, or not a mesh"
+            else "the file is damaged or is not a mesh"
         )
         raise InputError(path, "", f"cannot be read as a mesh: {why}") from None
     if resolver.refused is not None:
@@ -183,7 +183,7 @@ def _part(mesh: Any, matrix: F64, path: Path, pictures: dict[int, U8]) -> Part:
     """
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,) or faces.min() < 0 or faces.max() >= len(vertices):
-        raise InputError(path, "faces", "are not triangles of existing vertices")
+        raise InputError(path, "faces", "some faces refer to vertices that do not exist")
     visual, kind = mesh.visual, mesh.visual.kind
     picture, colour, opacity, colours = None, UNCOLOURED, 1.0, None
     if kind == "texture":

@@ -33,7 +33,7 @@ def load_compressed(header: PlyHeader) -> Gaussians:
     names = {*(splats.dtype.names or ())}
     kinds = ("position", "rotation", "scale", "color")
     if bounds is None or len(bounds) * CHUNK < len(splats) or not {f"packed_{kind}" for kind in kinds} <= names:
-        raise InputError(header.path, "chunk", "is missing, or lacks bounds for some splats")
+        raise InputError(header.path, "chunk", "is missing, or has no bounds for some splats")
     place, turn, scale, colour = (splats[f"packed_{kind}"].astype(np.uint32) for kind in kinds)
 
     def bounds_of(name: str, axes: str) -> list[F32]:
@@ -51,7 +51,7 @@ def load_compressed(header: PlyHeader) -> Gaussians:
     if fields := elements["sh"].dtype.names if "sh" in elements else ():
         rest = np.column_stack([elements["sh"][name] for name in fields])
         if rest.shape[1] not in COEFFICIENTS or len(rest) != len(splats):
-            raise InputError(header.path, "sh", "does not hold harmonics of degrees 1 to 3 for every splat")
+            raise InputError(header.path, "sh", "does not contain harmonics of degree 1 to 3 for every splat")
         higher = rest.reshape(len(rest), 3, -1).transpose(0, 2, 1)
         harmonics = with_higher(harmonics, higher, zero=127.5, unit=8 / 255)
     return drawable(
@@ -73,7 +73,9 @@ def load_splat(path: Path) -> Gaussians:
     """
     data = untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)
     if not data or len(data) % SPLAT.itemsize:
-        problem = f"is cut off, or not a .splat: it has {len(data)} bytes, not a multiple of {SPLAT.itemsize}"
+        problem = (
+            f"is truncated or is not a .splat: its size must be a multiple of {SPLAT.itemsize}, not {len(data)} bytes"
+        )
         raise InputError(path, "", problem)
     table = np.frombuffer(data, SPLAT)
     untrusted_input.within(len(table), LIMITS.splats, source=path, field="splats")

@@ -71,7 +71,12 @@ class SceneFile:
             up, out = custom or guessed_axes(low, high)
             if self.settings.fit and facing is not None:
                 up, out = turned_to_viewer(up, out, size=high - low, facing=facing)
-            log.info("%s: assuming that %s is up and %s points to the viewer (content.axes)", self.path.name, up, out)
+            log.info(
+                "%s: assuming that %s points up and %s points to the viewer; set content.axes to change this",
+                self.path.name,
+                up,
+                out,
+            )
         return axes_matrix(out=out, up=up)
 
 

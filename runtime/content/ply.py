@@ -78,17 +78,19 @@ def read_header(path: Path) -> PlyHeader:
             case ["property", kind, name] if kind in TYPES and properties:
                 fields.append((name, TYPES[kind]))
             case ["format" | "element" | "property", *_]:
-                raise InputError(path, "header", f"not understood: {untrusted_input.shown(line.strip())}")
+                raise InputError(path, "header", f"this line is not valid PLY: {untrusted_input.shown(line.strip())}")
     twice = any(len({name for name, _ in fields}) < len(fields) for fields in properties.values())
     if not order or not properties.get("vertex") or twice:
-        raise InputError(path, "vertex", "the header has no format, no vertices, or one of their properties twice")
+        raise InputError(path, "vertex", "the header declares no format, no vertices, or the same property twice")
     header = PlyHeader(path, order, counts, properties, newline + 1, size)
     for name, count in counts.items():
         field, kind = f"element {untrusted_input.shown(name)}", header.kind
         most = getattr(LIMITS, kind) * (3 if kind == "triangles" and name == "vertex" else 1)
         untrusted_input.within(count, most, source=path, field=field)
         if count > size:  # every element takes at least one byte
-            raise InputError(path, field, f"the file is cut off: {count:,} are declared in {size:,} bytes")
+            raise InputError(
+                path, field, f"the file is truncated: the header declares {count:,} elements in {size:,} bytes"
+            )
     return header
 
 
@@ -100,7 +102,9 @@ def read_elements(header: PlyHeader) -> dict[str, Table]:
     """
     path, place, found = header.path, header.starts_at, dict[str, Table]()
     if header.order == "ascii":
-        raise InputError(path, "format", "is ascii; splats are read from binary files")
+        raise InputError(
+            path, "format", "is ascii, but splats can only be read from binary files; save the file as binary PLY"
+        )
     with untrusted_input.open_regular(path) as file:
         for name, count in header.counts.items():
             if "list" in {kind for _, kind in header.properties[name]}:
@@ -108,11 +112,11 @@ def read_elements(header: PlyHeader) -> dict[str, Table]:
             dtype = np.dtype([(field, ORDERS[header.order] + kind) for field, kind in header.properties[name]])
             present = (header.size - place) // max(dtype.itemsize, 1)
             if present < count:
-                problem = f"the file is cut off: {count} are declared, {max(present, 0)} present"
+                problem = f"the file is truncated: only {max(present, 0)} of the {count} declared elements are present"
                 raise InputError(path, untrusted_input.shown(name), problem)
             file.seek(place)
             found[name] = np.frombuffer(file.read(count * dtype.itemsize), dtype)
             place += count * dtype.itemsize
     if "vertex" not in found:
-        raise InputError(path, "vertex", "must come before lists, with one number per property")
+        raise InputError(path, "vertex", "must come before any element with lists and have one number per property")
     return found

@@ -47,7 +47,7 @@ SIDES = ("left", "right")
 class ProgramOptions(Section):
     """Options in [content.options] for the scene `program`."""
 
-    port: int = Field(0, ge=0, le=65535, description="TCP port to listen on; 0: any free port")
+    port: int = Field(0, ge=0, le=65535, description="TCP port to listen on; 0 for any free port")
 
 
 def prepare(file: SceneFile) -> Callable[[Any], ContentSource]:
@@ -129,12 +129,10 @@ class Programs:
                 self._connected, HOST, port, process_request=self._refused, max_size=most_bytes, compression=None
             )
         except OSError as error:
-            raise InputError(
-                "content.options", "port", f"{port}: cannot be opened for listening ({error.strerror})"
-            ) from None
+            raise InputError("content.options", "port", f"cannot listen on port {port}: {error.strerror}") from None
         self.address = f"ws://{HOST}:{self._server.socket.getsockname()[1]}/?token={self._token}"
         begin("programs", self._server.serve_forever)
-        log.info("waiting for a program; its address is in `phasestack status` (program)")
+        log.info("waiting for a program to connect; `phasestack status` shows the address under `program`")
 
     def ask(self, views: Sequence[View], *, time_ns: int) -> int:
         """Request a frame's pictures, and return the frame's number.
@@ -161,7 +159,7 @@ class Programs:
                 connection.send(message)
         if program is None:
             why = f" ({self.problem})" if self.problem else ""
-            raise ContentFailure(f"no program is connected{why}: its address is in the status (program)")
+            raise ContentFailure(f"no program is connected{why}; the status shows its address under `program`")
         if number not in self._frames:
             raise ContentFailure(f"the program is late: {IN_FLIGHT_MAX} requests are unanswered")
         return number
@@ -178,7 +176,7 @@ class Programs:
                 self._changed.wait_for(lambda: side in frame.pictures or number not in self._frames, within_s)
                 if side in frame.pictures:
                     return frame.pictures[side]
-        raise ContentFailure(self.problem or f"the program has not answered within {1e3 * ANSWERED_S:.0f} ms")
+        raise ContentFailure(self.problem or f"the program did not answer within {1e3 * ANSWERED_S:.0f} ms")
 
     def done(self, number: int) -> None:
         """Declare that no more of a frame's pictures are needed.
@@ -199,7 +197,7 @@ class Programs:
     def _refused(self, connection: ServerConnection, request: Any) -> Any:
         token = parse_qs(urlsplit(request.path).query).get("token", [""])[0]
         if not hmac.compare_digest(token.encode(), self._token.encode()):
-            return connection.respond(403, "the token of the address is wrong\n")
+            return connection.respond(403, "the token in the address is wrong\n")
         return None
 
     def _connected(self, connection: ServerConnection) -> None:
@@ -207,11 +205,11 @@ class Programs:
 
         A program's first message states whether it draws or only listens.
         """
-        why = "it closed the connection"
+        why = "the program closed the connection"
         try:
             hello = json.loads(connection.recv(timeout=HELLO_S))
             if not isinstance(hello, dict):
-                raise ValueError("does not begin with a JSON object")
+                raise ValueError("the first message is not a JSON object")
             self._welcome(connection, hello)
             for message in connection:
                 self._take(connection, message)
@@ -227,7 +225,7 @@ class Programs:
                     self._drawing, self.problem = None, why
                     self._frames.clear()
                     self._changed.notify_all()
-                    log.warning("the program disconnected: %s", why)
+                    log.warning("lost the drawing program: %s", why)
 
     def _welcome(self, connection: ServerConnection, hello: dict[str, Any]) -> None:
         with self._changed:
@@ -245,7 +243,7 @@ class Programs:
     def _take(self, connection: ServerConnection, message: str | bytes) -> None:
         """Store a picture from a program. Raises ValueError if the message has the wrong type or size."""
         if not isinstance(message, bytes) or len(message) < HEAD.size:
-            raise ValueError("its answer is not a picture")
+            raise ValueError("the answer is not a picture")
         number, side = HEAD.unpack_from(message)
         with self._changed:
             frame = self._frames.get(number)
@@ -254,7 +252,7 @@ class Programs:
             height, width = frame.views[0].height_px, frame.views[0].width_px
             if len(message) - HEAD.size != 4 * width * height:
                 size = len(message) - HEAD.size
-                raise ValueError(f"it answered with {size} bytes for {width}x{height} RGBA pixels")
+                raise ValueError(f"the answer has {size} bytes instead of {width}x{height} RGBA pixels")
             picture = np.frombuffer(message, np.uint8, offset=HEAD.size).reshape(height, width, 4)
             frame.pictures[side] = np.ascontiguousarray(picture[::-1]) if self._bottom_up else picture
             if frame.complete:

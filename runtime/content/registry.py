@@ -32,8 +32,8 @@ SPLATS = (".ply", ".splat", ".spz", ".sog")  # a .ply may be a mesh
 PLAYLISTS = (".toml", ".json")
 HARMLESS = {".png": PNG, ".jpg": JPEG, ".jpeg": JPEG}  # first bytes of stills that are read without a child process
 HARMLESS_PX = 4096 * 4096  # most pixels in such a still
-TO_GLTF, TO_PLY = "export it as glTF (.glb), as Blender does", "save it as PLY, as CloudCompare does"
-TO_SPLATS = "convert it: `npx @playcanvas/splat-transform in{} out.ply`"
+TO_GLTF, TO_PLY = "export it as glTF (.glb), for example with Blender", "save it as PLY, for example with CloudCompare"
+TO_SPLATS = "convert it with `npx @playcanvas/splat-transform in{} out.ply`"
 FILMS = (".wmv", ".flv", ".mpg", ".mpeg", ".ts", ".m2ts", ".mts", ".3gp", ".ogv", ".vob")
 OTHER_FILES = {  # kind of file and remedy, keyed by the suffix of unsupported files
     **dict.fromkeys((".fbx", ".dae", ".blend", ".3ds", ".x3d", ".wrl", ".abc"), ("a 3D scene", TO_GLTF)),
@@ -42,8 +42,8 @@ OTHER_FILES = {  # kind of file and remedy, keyed by the suffix of unsupported f
         (".3mf", ".step", ".stp", ".iges", ".igs"), ("a CAD or 3D-print model", "export it as STL or glTF")
     ),
     **dict.fromkeys((".xyz", ".pts", ".pcd", ".las", ".laz", ".e57"), ("a point cloud", TO_PLY)),
-    **dict.fromkeys(FILMS, ("a film", "convert it: `ffmpeg -i in{} out.mp4`")),
-    **dict.fromkeys((".ksplat", ".lcc"), ("compressed splats", TO_SPLATS)),
+    **dict.fromkeys(FILMS, ("a film", "convert it with `ffmpeg -i in{} out.mp4`")),
+    **dict.fromkeys((".ksplat", ".lcc"), ("a compressed splat file", TO_SPLATS)),
 }
 LFS = b"version https://git-lfs"
 TRIED_PX = (32, 18)  # size of the trial picture drawn with a user-defined scene
@@ -75,7 +75,7 @@ def prepare_content(settings: ContentSettings, stack: PanelStack) -> Opener:
         InputError: The scene cannot be shown or takes too long to load. The message names the file and the field.
     """
     file = SceneFile(Path(settings.scene), settings, stack)
-    too_slow = InputError(settings.scene, "", f"takes longer to load than {LIMITS.load_s:g} s")
+    too_slow = InputError(settings.scene, "", f"takes longer than {LIMITS.load_s:g} s to load")
     with progress.task(f"loading {settings.scene}", seconds=LIMITS.load_s, too_slow=too_slow):
         return _placed(file)
 
@@ -91,22 +91,26 @@ def _prepared(file: SceneFile) -> Opener:
         return _built_in(name, file)
     if name in preset_names():
         if not settings.file:
-            raise InputError("content", "file", f"is missing: {name}'s .ply, .glb or data-set folder (not shipped)")
+            raise InputError(
+                "content",
+                "file",
+                f"is missing; set it to the .ply, .glb or data-set folder of {name}, which is not shipped",
+            )
         return _from_path(replace(file, path=Path(settings.file), preset=name))
     if name == "program":
         from runtime.content import program
 
         return program.prepare(file)
     if "://" in name or name.startswith("/dev/video"):
-        problem = "live pictures need a class of your own (module:Class) or a program (docs/content.md)"
+        problem = "live pictures require your own class (module:Class) or a program; see docs/content.md"
         raise InputError("content", "scene", f"{untrusted_input.shown(without_secrets(name))}: {problem}")
     if is_plugin(name):
         return _plugin(name, file)
     if not untrusted_input.checked_path(name, source="content", field="scene").exists():
         presets = preset_names()
         meant = nearest(name, (*SCENES, *presets))
-        some = f"built in: {', '.join(SCENES)}; {len(presets)} presets, such as lego_bulldozer"
-        problem = f"`{name}` is neither a file or folder nor a scene's name{meant} ({some})"
+        some = f"use {', '.join(SCENES)} or one of {len(presets)} presets such as lego_bulldozer"
+        problem = f"`{name}` is not a file, a folder or the name of a scene{meant} ({some})"
         raise InputError("content", "scene", problem)
     return _from_path(file)
 
@@ -119,11 +123,11 @@ def _from_path(file: SceneFile) -> Opener:
     suffix = path.suffix.lower()
     if suffix in OTHER_FILES and path.is_file():
         kind, way_out = OTHER_FILES[suffix]
-        raise InputError(path, "", f"is {kind} ({suffix}), which is not supported: {way_out.format(suffix)}")
+        raise InputError(path, "", f"is {kind} ({suffix}), which is not supported; {way_out.format(suffix)}")
     if suffix in (*MESHES, *SPLATS) and path.is_file():
         with untrusted_input.open_regular(path) as opened:
             if opened.read(len(LFS)) == LFS:
-                raise InputError(path, "", "is a Git LFS pointer: fetch the file itself (git lfs pull)")
+                raise InputError(path, "", "is a Git LFS pointer; fetch the file itself with `git lfs pull`")
     progress.tell(f"loading {path.name}", 0)
     if suffix in PLAYLISTS and not path.is_dir():
         return _playlist(file)
@@ -221,7 +225,7 @@ def _plugin(name: str, file: SceneFile) -> Opener:
             raise InputError(name, "", written(error)) from error
         if getattr(picture, "shape", None) != (*TRIED_PX[::-1], 4) or picture.dtype != np.uint8:
             source.close()
-            raise InputError(name, "render", "must return (height_px, width_px, 4) RGBA, uint8")
+            raise InputError(name, "render", "must return an array (height_px, width_px, 4) of RGBA in uint8")
         return source
 
     return make

@@ -52,7 +52,7 @@ def split_rgbd(rgb: U8, path: Path) -> tuple[U8, F32]:
     """
     width = rgb.shape[1] // 2
     if width < 2 or rgb.shape[0] < 2:
-        raise InputError(path, "layout", "the picture is too small for colour and depth side by side")
+        raise InputError(path, "layout", "the picture is too small to contain colour and depth side by side")
     depth = rgb[:, width : 2 * width]
     if np.ptp(depth[::4, ::4].astype(np.int16), axis=2).max() > 24:
         raise InputError(path, "layout", "the right half is not a grey depth map")

@@ -185,7 +185,7 @@ def build_run(
     if simulated:
         samples = RecordedSamples(driver)
         cleanup.callback(samples.close)
-    host.starting("opening OpenGL")
+    host.starting("creating the OpenGL context")
     context = offscreen_context()
     cleanup.callback(context.release)
     panels: PanelSink = (
@@ -203,12 +203,12 @@ def build_run(
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         solver = thread = SolverThread(maker, clock)
         cleanup.callback(solver.close)
-        thread.wait_ready(lambda: host.starting("loading content and model"), max_s=LIMITS.start_s)
+        thread.wait_ready(lambda: host.starting("loading the scene and the model"), max_s=LIMITS.start_s)
         samples = worker = SensorWorker(make_driver, settings.sensor, clock, make_find)
         cleanup.callback(worker.close)
         worker.start()
     if maker.run is None:
-        raise Stopped("stopped while starting")
+        raise Stopped("stopped during startup")
     in_stack_frame = driver.capabilities.in_stack_frame
     run_cell = maker.run
     drawer = TargetDrawer(
@@ -260,7 +260,7 @@ def build_run(
 
 def _open_panels(settings: Settings, stack: PanelStack, clock: Clock, context: Any, host: Host) -> PanelSink:
     while True:
-        host.starting("opening panels")
+        host.starting("opening the panels")
         try:
             return open_panels(settings.output, stack, clock, context)
         except PanelLost as error:

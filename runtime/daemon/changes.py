@@ -63,7 +63,9 @@ class Choices:
         settings, before = read(), self.configured
         frozen = [name for name in NEEDS_RESTART if attrgetter(name)(settings) != attrgetter(name)(before)]
         if frozen:
-            raise InputError("reload", ", ".join(frozen), "cannot change while the service runs; restart it")
+            raise InputError(
+                "reload", ", ".join(frozen), "cannot change while the service is running; restart the service"
+            )
         same = {at: value for at, value in self.chosen.items() if _value(settings, at) == _value(before, at)}
         return Choices(settings, same)
 
@@ -139,7 +141,7 @@ class Changes:
         (current, loading), waiting = self._loading, self._next
         for skipped in (None if loading.abandoned else current, waiting):
             if skipped is not None:
-                self.answer(skipped.command, "skipped in favour of a newer change")
+                self.answer(skipped.command, "superseded by a newer change")
         loading.abandon()
         self._next = change
 
@@ -168,7 +170,7 @@ class Changes:
 
         def skip(parts: Any) -> str:
             skipped = parts.run.state.content.skip(time_ns=self._presenter.clock.now_ns())
-            return "" if skipped else "there is no next entry; the scene is not a playlist or shows its last entry"
+            return "" if skipped else "there is no next entry: the scene is not a playlist, or it is at its last entry"
 
         self._between_steps(command, skip)
 
@@ -204,7 +206,7 @@ class Changes:
             state = self._presenter.run_cell.state
             moved = moved_since(loading.settings.content, state.settings.content)  # moved during loading
             self.choices = change.choices.choosing("content", **moved)
-            log.info("changed: scene %s, model %s", state.content.info.name, state.predictor.name)
+            log.info("now showing the scene %s with the model %s", state.content.info.name, state.predictor.name)
         self.answer(change.command, loading.problem)
 
     def _between_steps(

@@ -76,7 +76,7 @@ def ask(paths: Iterable[Path], request: dict[str, Any], *, timeout_s: float = 10
         except (OSError, ValueError) as error:
             problems.append(f"{path}: {_advice(error)}")
             hangs |= isinstance(error, TimeoutError)
-    silent = NotRunning("; ".join(problems) or "no socket is configured")
+    silent = NotRunning("; ".join(problems) or "no socket is configured; set service.socket")
     silent.hangs = hangs
     raise silent
 
@@ -93,7 +93,7 @@ def _exchanged(path: Path, request: dict[str, Any], timeout_s: float) -> dict[st
         with channel.makefile("rb") as answers:
             line = answers.readline()
     if not line:
-        raise ConnectionResetError("the connection was closed without an answer")
+        raise ConnectionResetError("the daemon closed the connection without an answer")
     answer: dict[str, Any] = json.loads(line)
     return answer
 
@@ -101,13 +101,13 @@ def _exchanged(path: Path, request: dict[str, Any], timeout_s: float) -> dict[st
 def _advice(error: Exception) -> str:
     match error:
         case FileNotFoundError():
-            return "no daemon"
+            return "no daemon is listening"
         case PermissionError():
-            return "permission denied (add this user to the group phasestack)"
+            return "permission denied; add this user to the group phasestack"
         case ConnectionRefusedError():
             return "the daemon has died"
         case TimeoutError():
-            return "no answer in time; the daemon hangs"
+            return "the daemon did not answer in time"
     return str(error) or type(error).__name__
 
 
@@ -132,7 +132,7 @@ def unit_advice() -> str:
         case "failed", "start-limit-hit":
             return f"{UNIT} failed too often; run: sudo systemctl reset-failed {UNIT}; sudo systemctl start {UNIT}"
         case "failed", _:
-            return f"{UNIT} has failed ({why}); fix this, then run: sudo systemctl restart {UNIT}"
+            return f"{UNIT} has failed ({why}); fix the error, then run: sudo systemctl restart {UNIT}"
         case "inactive", _:
             return f"{UNIT} is stopped; run: sudo systemctl start {UNIT}"
         case "activating" | "deactivating", _:

@@ -46,13 +46,13 @@ def parse(request: Any) -> Command:
         raise ValueError("a request must be one JSON object")
     name, value = request.get("command"), request.get("value")
     if name not in NAMES:
-        raise ValueError(f"command: unknown command; must be one of status, {', '.join(NAMES)}")
+        raise ValueError(f"command: unknown command; use one of status, {', '.join(NAMES)}")
     if name in ("scene", "model") and not (isinstance(value, str) and value):
         raise ValueError(f"value: {name} requires a name")
     if name == "place":
         value = value if value is not None else {}
         if not isinstance(value, dict):
-            raise ValueError("value: place requires an object of settings, or null for the configured ones")
+            raise ValueError("value: place requires an object of settings, or null to restore the configured placement")
         for key in value:
             if key not in PLACING:
                 raise ValueError(f"value.{shown(key)}: place accepts only {', '.join(PLACING)}")

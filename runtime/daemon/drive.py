@@ -64,7 +64,11 @@ def _unseen(layers: U8, account: RefreshAccount, run: Run, settings: Settings) -
     away_m = max(USUAL_M, stack.x_m[-1] + USUAL_M / 2)
     eyes_m = np.array([[away_m, -IPD_M / 2, 0.0], [away_m, IPD_M / 2, 0.0]])
     eyes_m = eyes_m if account.eyes_m is None else account.eyes_m
-    title = "Flat picture, because no viewer was seen" if is_flat else "Last refresh, not measured"
+    title = (
+        "This is the flat picture because no viewer was seen"
+        if is_flat
+        else "This is the last refresh; its quality was not measured"
+    )
     fov_deg = settings.content.fov_deg
     return viewer_html(layers, (), stack, eyes_m=eyes_m, fov_deg=fov_deg, text=[title], follows=not is_flat)
 
@@ -75,14 +79,14 @@ def print_summary(summary: dict[str, Any], out: Path | None) -> None:
     for line in lines_of({name: value for name, value in summary.items() if name not in (*configured, "configured")}):
         print(line)
     if configured:
-        print("configured for the simulated clock, not measured:")
+        print("these figures are configured for the simulated clock, not measured:")
         for line in lines_of({name: summary[name] for name in configured}):
             print(f"  {line}")
     if summary["live_db"] is not None:
-        print("quote live_db for motion: light PSNR at the true eyes, against the target of each refresh")
+        print("for a moving head, quote live_db: the light PSNR at the true eyes against the target of each refresh")
     if summary["light_db"] is not None:
-        print("quote light_db for a head at rest: light PSNR at the eyes used, for a tracking error of 1 mm")
+        print("for a head at rest, quote light_db: the light PSNR at the eyes used, with a tracking error of 1 mm")
     if not summary["inferences"]:
-        print("no solution was shown because no viewer was seen or the run ended too early (--frames)")
+        print("no solution was shown, either because no viewer was seen or because --frames ended the run too early")
     if out is not None:
-        print(f"see {out}/contact-sheet.png or, to look around, {out}/viewer.html")
+        print(f"see {out}/contact-sheet.png, or open {out}/viewer.html to look around")

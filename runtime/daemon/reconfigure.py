@@ -119,7 +119,7 @@ class Reconfiguration:
 
     def _listen(self, what: str, done: int, total: int | None) -> None:
         if self.abandoned:
-            raise Stopped("replaced by a newer change")
+            raise Stopped("superseded by a newer change")
         if what:
             self.progress = f"{what}: {done} of {total}" if total else f"{what}: {done}" if done else what
 

@@ -169,10 +169,10 @@ class StatusServer:
         if len(self._clients) >= CLIENTS_MAX:
             longest = next(iter(self._reading), None)
             if longest is None:
-                raise Refusal("too many clients")
+                raise Refusal("too many clients are connected")
             self._reading.pop(longest)
             self._clients.discard(longest)  # not only when its task ends, because more clients may connect
-            longest.cancel("too many clients")
+            longest.cancel("too many clients are connected")
 
     async def _request(self, reader: StreamReader, task: asyncio.Task[None]) -> bytes:
         """Return the next request, including its newline. At end of input, it may be incomplete.
@@ -209,7 +209,7 @@ class StatusServer:
 
 def _log_error(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
     """Log an error in the event loop, such as a shortage of file descriptors. Asyncio then tries again."""
-    log.warning("status: %s", one_line(f"{context.get('message')} ({context.get('exception')})"))
+    log.warning("status socket: %s", one_line(f"{context.get('message')} ({context.get('exception')})"))
 
 
 def _line(answer: dict[str, Any]) -> bytes:
@@ -238,7 +238,7 @@ async def _outcome(command: Command, writer: StreamWriter) -> dict[str, Any]:
         while not done and time.monotonic() < until_s and not _is_gone(writer):
             done, _ = await asyncio.wait({answer}, timeout=min(LOOKED_AGAIN_S, LOOP_ANSWERS_WITHIN_S))
         if not done and command.answer.cancel():
-            problem = f"the display loop did not answer within {LOOP_ANSWERS_WITHIN_S:g} s; the command was not run"
+            problem = f"the display loop did not answer within {LOOP_ANSWERS_WITHIN_S:g} s, so the command was not run"
             return {"ok": False, "error": problem}
         done, _ = await asyncio.wait({answer}, timeout=LOADED_WITHIN_S)
     except asyncio.CancelledError as stops:

@@ -48,7 +48,7 @@ def listening_socket(path: Path) -> socket.socket:
             made.listen(BACKLOG)
     except OSError as error:
         made.close()
-        raise InputError("service", "socket", f"{path} cannot be created ({error.strerror or error})") from error
+        raise InputError("service", "socket", f"{path} cannot be created: {error.strerror or error}") from error
     except BaseException:
         made.close()
         raise
@@ -57,7 +57,7 @@ def listening_socket(path: Path) -> socket.socket:
         if path.lstat().st_gid != group:  # a sandbox may refuse a chown even if it would change nothing
             os.chown(path, -1, group)
     except (KeyError, PermissionError):
-        log.info("only this user can use the status socket; the group %s does not exist or lacks this user", GROUP)
+        log.info("only this user can use the status socket; to share it, add this user to the group %s", GROUP)
     return made
 
 
@@ -90,7 +90,9 @@ def _remove_dead(path: Path) -> None:
     if not os.path.lexists(path):
         return
     if not stat.S_ISSOCK(path.lstat().st_mode):
-        raise InputError("service", "socket", f"{path} exists and is not a socket")
+        raise InputError(
+            "service", "socket", f"{path} already exists and is not a socket; delete it or choose another path"
+        )
     owner = ""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)

@@ -84,7 +84,7 @@ class RunningSolver:
             try:
                 release()
             except Exception as error:  # for example because the context was lost
-                log.warning("closing the solver: %s", error)
+                log.warning("error while closing the solver: %s", error)
 
 
 class SolverMaker:

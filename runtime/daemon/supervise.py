@@ -162,7 +162,7 @@ class Daemon(Host):
     def _write_black_box(self, command: Command) -> None:
         """Write the black box to a file. The command is answered by the thread that writes it."""
         if self.recorder is None:
-            command.refuse("this run has no black box (service.blackbox_minutes is 0)")
+            command.refuse("the black box is switched off; set service.blackbox_minutes above 0")
             return
 
         def saved(problem: str, path: Path | None) -> None:

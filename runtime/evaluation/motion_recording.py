@@ -46,9 +46,9 @@ def write_motion(
         InputError: The motion is unknown, the length is out of range, or the file cannot be written.
     """
     if motion not in MOTIONS:
-        raise InputError("record", "--motion", f"unknown motion {motion!r}; choose from {', '.join(MOTIONS)}")
+        raise InputError("record", "--motion", f"unknown motion {motion!r}; use one of {', '.join(MOTIONS)}")
     if not 2 / rate_hz <= seconds <= SECONDS_MAX:
-        raise InputError("record", "--seconds", f"is {seconds:g}; must be {2 / rate_hz:g} to {SECONDS_MAX:g}")
+        raise InputError("record", "--seconds", f"must be from {2 / rate_hz:g} to {SECONDS_MAX:g}, not {seconds:g}")
     way = path_of(seed)
     how = {"seconds": seconds, "rate_hz": rate_hz, "noise_m": noise_mm / 1000}
     observed = observe(motion, **how, seed=1 + seed, path=way)
@@ -62,6 +62,6 @@ def write_motion(
                 place = seen.points.eyes_m @ sensor_from_stack[:3, :3].T + sensor_from_stack[:3, 3]
                 points = EyePoints(place, seen.points.confidence)
             if not writer.write(SensorFrame(number, seen.capture_ns, points, true_eyes_m=eyes)):
-                raise InputError(path, "", "the recording would be larger than its limit")
+                raise InputError(path, "", "the recording would exceed the size limit; use a lower value")
     description = {"motion": motion, "seed": seed, "rate_hz": rate_hz, "noise_mm": noise_mm}
     return description | {"file": str(path), "samples": len(observed), "seconds": (len(observed) - 1) / rate_hz}

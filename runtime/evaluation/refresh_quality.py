@@ -90,11 +90,11 @@ def measure_refresh(
         try:
             error = live_error(layers, targets.true, stack, eyes_m=account.true_eyes_m, fov_deg=targets.fov_deg)
         except ValueError as why:
-            log.info("live quality: not measured here (%s)", why)
+            log.info("the live quality of this refresh was not measured: %s", why)
     try:
         moment, figures = _at_aligned_eyes(account, layers, carried, targets, stack)
     except ValueError as why:
-        log.info("quality: not measured here (%s)", why)
+        log.info("the quality of this refresh was not measured: %s", why)
         return RefreshQuality(live_error=error)
     return RefreshQuality(figures, error, moment)
 
@@ -142,6 +142,6 @@ def _line(account: RefreshAccount) -> str:
     assert account.eyes_m is not None and account.solved_for_m is not None
     moved_mm = view_error_mm(account.eyes_m, account.solved_for_m)
     return (
-        f"Refresh {account.frame}; the eyes were {moved_mm:.0f} mm from where the layers were solved for; "
-        "the outer panels were shifted accordingly"
+        f"Refresh {account.frame}: the eyes were {moved_mm:.0f} mm from where the layers were solved for; "
+        "the outer panels were shifted to match"
     )

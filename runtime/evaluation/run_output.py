@@ -57,7 +57,7 @@ class RunOutput:
             self._lines = (self._folder.staging / "frames.jsonl").open("w", encoding="utf-8")
         except OSError as error:
             self._folder.__exit__(InputError, None, None)
-            raise InputError(self._target, "", f"cannot be written ({error.strerror})") from None
+            raise InputError(self._target, "", f"cannot be written: {error.strerror}") from None
         self._writer.start()
         return self
 
@@ -67,7 +67,9 @@ class RunOutput:
         if self._lines is not None:
             self._attempt(self._lines.close)
         if self.left_out:
-            log.warning("output: the disk was too slow for %d lines or pictures of %s", self.left_out, self._target)
+            log.warning(
+                "output: dropped %d lines or pictures of %s because the disk was too slow", self.left_out, self._target
+            )
         if self.problem:
             kind = kind or InputError  # so that the folder discards its incomplete files
         self._attempt(lambda: self._folder.__exit__(kind, error, trace))
@@ -199,7 +201,7 @@ class RunOutput:
         if self.problem:
             return
         self.problem = why
-        log.warning("output abandoned; nothing new was written to %s: %s", self._target, why, exc_info=trace)
+        log.warning("output: abandoned without writing to %s: %s", self._target, why, exc_info=trace)
         self._folder.discard()  # immediately, because the files may be filling the disk
 
     def _line(self, line: Mapping[str, Any]) -> None:
@@ -209,7 +211,11 @@ class RunOutput:
 
 def in_one_line(summary: dict[str, Any]) -> str:
     """Return a line about a run for the contact sheet, with the live quality if it was measured."""
-    line = f"The run: {summary['presented']} of {summary['frames']} refreshes presented, model {summary['model']}"
+    line = (
+        f"The run presented {summary['presented']} of {summary['frames']} refreshes with the model {summary['model']}"
+    )
     if summary.get("live_db") is not None:
-        line += f"; while the head moved, PSNR {summary['live_db']:.1f} dB at the true eyes (live), delays included"
+        line += (
+            f"; while the head moved, the live PSNR at the true eyes was {summary['live_db']:.1f} dB, including delays"
+        )
     return line

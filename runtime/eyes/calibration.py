@@ -121,7 +121,7 @@ class Calibration:
         calibrated = self.file.sensor_serial
         if not calibrated or serial == calibrated:
             return ""
-        actual = f"the sensor is {serial}" if serial else "the connected sensor reports no serial number"
+        actual = f"the connected sensor is {serial}" if serial else "the connected sensor reports no serial number"
         return f"{self.source}: the calibration is for sensor {calibrated}, but {actual}; calibrate again"
 
 
@@ -167,24 +167,30 @@ def check_similarity(matrix: F64, *, source: str | Path) -> None:
     """
     name = "stack_from_sensor"
     if not np.abs(matrix).max() <= MOST:
-        raise InputError(source, name, f"has an entry beyond {MOST:g}")
+        raise InputError(source, name, f"contains a number that exceeds {MOST:g}")
     if not np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0]):
         raise InputError(source, name, "must have 0, 0, 0, 1 as its last row")
     defect = similarity_defect(matrix)
     if not defect <= SIMILARITY_TOLERANCE:
         raise InputError(
-            source, name, f"must be a rotation times one scale (off by {defect:.2g}, allowed {SIMILARITY_TOLERANCE})"
+            source,
+            name,
+            f"must be a rotation times one scale to within {SIMILARITY_TOLERANCE}, but is off by {defect:.2g}",
         )
     largest = float(np.abs(matrix[:3, :3]).max())
     volume = float(np.linalg.det(matrix[:3, :3] / largest))
     if volume <= 0.0:
-        raise InputError(source, name, "mirrors space (determinant not positive); check the directions of the axes")
+        raise InputError(
+            source, name, "mirrors space (its determinant is not positive); check the directions of the axes"
+        )
     scale = largest * float(np.cbrt(volume))  # without scaling, the determinant could overflow
     if not SCALE[0] <= scale <= SCALE[1]:
-        raise InputError(source, name, f"has scale {scale:.3g}; between two frames in metres it must be about 1")
+        raise InputError(
+            source, name, f"has scale {scale:.3g}, but it must be about 1; check that both frames are in metres"
+        )
     distance_m = float(np.linalg.norm(matrix[:3, 3]))
     if distance_m > MAX_DISTANCE_M:
-        problem = f"puts the sensor {distance_m:.4g} m from the display, but the maximum is {MAX_DISTANCE_M:g} m"
+        problem = f"places the sensor {distance_m:.4g} m from the display, but the maximum is {MAX_DISTANCE_M:g} m"
         raise InputError(source, name, problem)
 
 
@@ -192,14 +198,14 @@ def _warnings(matrix: F64, source: str) -> tuple[str, ...]:
     warnings = []
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     if not PLAUSIBLE_SCALE[0] <= scale <= PLAUSIBLE_SCALE[1]:
-        reason = "are both frames in metres?"
+        reason = "check that both frames are in metres"
         if 800 < scale < 1250 or 0.0008 < scale < 0.00125:
-            reason = "one side seems to be in millimetres"
-        warnings.append(f"{source}: stack_from_sensor: scale {scale:.6g} is far from 1: {reason}")
+            reason = "one side appears to be in millimetres"
+        warnings.append(f"{source}: stack_from_sensor: the scale {scale:.6g} is far from 1; {reason}")
     distance_m = float(np.linalg.norm(matrix[:3, 3]))
     if distance_m > NEAR_M:
         warnings.append(
-            f"{source}: stack_from_sensor: the sensor is {distance_m:.3g} m from the display, which is unusual"
+            f"{source}: stack_from_sensor: the sensor is {distance_m:.3g} m from the display; check this distance"
         )
     return tuple(warnings)
 

@@ -61,7 +61,7 @@ class EyeFinder:
         """
         self.pupils = None
         if frame.colour is None:
-            self.reason = "the sensor delivers no colour picture"
+            self.reason = "the sensor does not deliver colour pictures"
             return None
         self.pupils = pupils = self._finder.find(frame.colour, time_ns=frame.capture_ns)
         if self._finder.viewer != self._viewer:
@@ -69,7 +69,7 @@ class EyeFinder:
             self._depth, self._viewer = self._new_depth(), self._finder.viewer
         self.reason = self._finder.reason
         if pupils is None or frame.intrinsics is None:
-            self.reason = self.reason or "the camera reports no intrinsics, so the eyes' distance is unknown"
+            self.reason = self.reason or "the distance of the eyes is unknown because the camera reports no intrinsics"
             return None
         scale = np.ones(2)
         if frame.depth_mm is not None:  # the registered pictures may differ in size
@@ -79,7 +79,7 @@ class EyeFinder:
             self.reason = "the depth measured on the face does not match a person's size"
             return None
         if depths.eyes_m.mean() > RANGE_MAX_M:
-            self.reason = f"the face is {depths.eyes_m.mean():.1f} m away, beyond {RANGE_MAX_M:g} m"
+            self.reason = f"the face is {depths.eyes_m.mean():.1f} m away, but the maximum is {RANGE_MAX_M:g} m"
             return None
         return _eye_points(pupils, depths, frame.intrinsics)
 

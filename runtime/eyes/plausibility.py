@@ -93,7 +93,7 @@ class RefusalWatch:
         commonest, count = Counter(filter(None, self._last)).most_common(1)[0] if any(self._last) else ("", 0)
         before = self.warning
         if count > WARNING_SHARE * len(self._last):
-            hint = f": {_HINTS[commonest]}" if commonest in _HINTS else ""
+            hint = f"; {_HINTS[commonest]}" if commonest in _HINTS else ""
             self.warning = f"sensor: the eyes are {commonest}{hint}"
             return self.warning if self.warning != before else ""
         if before and count < WARNING_SHARE / 2 * len(self._last):

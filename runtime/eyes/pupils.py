@@ -131,7 +131,7 @@ class PupilFinder:
         """
         if self._looks is not None and time_ns - self._seen_ns > self._lock_ns:
             self.forget()
-            self.choice = "none: the viewer left"
+            self.choice = "the viewer has left"
         look, seen = self._follow(picture), "followed"
         if look is None:
             look, seen = self._search(picture), "found"
@@ -173,7 +173,7 @@ class PupilFinder:
             if not look.are_human():
                 self.reason = "a face without a person's eyes"
             elif self._looks is None:
-                self.choice = f"locked on the foremost of {len(faces)} face(s)"
+                self.choice = f"following the foremost of {len(faces)} face(s)"
                 self.viewer += 1
                 return look
             elif look.looks @ self._looks > SAME_LOOKS:

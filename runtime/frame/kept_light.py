@@ -111,7 +111,11 @@ class KeptLight:
             while not drawn.is_set() and not stopped():
                 drawn.wait(LOOK_S)
             if not drawn.is_set():
-                log.warning("stopped: %d of %d refreshes with kept light have no target pictures", total - done, total)
+                log.warning(
+                    "stopped early: %d of %d refreshes kept by --keep-light have no target pictures",
+                    total - done,
+                    total,
+                )
                 for rest in self._kept[done:]:
                     self._write(rest, RefreshTargets(self._drawer.fov_deg()))
                 return

@@ -193,7 +193,7 @@ class Presenter:
                 reason = "the recording has ended"
             reason = reason or self._supervisor.stop_reason()
             if frames is not None and self.stats.frames >= frames:
-                reason = reason or f"{frames} frames done"
+                reason = reason or f"reached the limit of {frames} frames"
         self.machine.update(Conditions("none", {}, presented=True, stopping=reason), now_ns=self.clock.now_ns())
         return reason
 

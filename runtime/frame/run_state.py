@@ -13,7 +13,7 @@ from runtime.errors import Stopped
 from runtime.eyes.calibration import Calibration
 from runtime.model.predictor import Predictor
 
-LEFT_BEHIND = "content or model took too long to load, so the solver was restarted; nothing has changed"
+LEFT_BEHIND = "the scene or the model took too long to load, so the solver was restarted with the old settings"
 
 
 @dataclass(frozen=True, slots=True)

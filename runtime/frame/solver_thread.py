@@ -96,7 +96,7 @@ class SolverThread(SolverHost):
             if not go_on():
                 return
             if self._clock.now_ns() - begun_ns > max_s * NS_PER_S:
-                raise FatalError(f"content and model: still not ready after {max_s:g} s")
+                raise FatalError(f"the scene and the model were not ready within {max_s:g} s")
         if self._attempt.error is not None:
             raise self._attempt.error
 
@@ -150,13 +150,13 @@ class SolverThread(SolverHost):
             if busy_ns > self._abandon_ns:
                 with suppress(TransientError):  # no thread is available, so the next refresh tries again
                     self._attempt = self._begin(attempt.number + 1)
-            return f"the solver failed; restarting ({_line(attempt.error)})"
+            return f"the solver failed and is restarting: {_line(attempt.error)}"
         if busy_ns <= 2 * self._late_ns:
             steps = tuple(attempt.took_ns)
             late = sum(took_ns > self._late_ns for took_ns in steps)
             self._is_late = late == LATE_STEPS or (self._is_late and late > 0)
             took_ms, limit_ms = max(steps, default=0) / NS_PER_MS, self._late_ns / NS_PER_MS
-            return f"solutions take {took_ms:.0f} ms (late: more than {limit_ms:.0f} ms)" if self._is_late else ""
+            return f"solutions take {took_ms:.0f} ms, more than the limit of {limit_ms:.0f} ms" if self._is_late else ""
         abandon_ns = self._abandon_ns
         if not attempt.ready.is_set() or attempt.is_at_task:
             limit_s = LIMITS.load_s if attempt.ready.is_set() else LIMITS.start_s
@@ -170,7 +170,7 @@ class SolverThread(SolverHost):
                     attempt.abandoned.set()
                 self._hung.append(attempt)
                 self.restarts += 1
-                log.error("solver: no answer for %.1f s; abandoned, starting a new one", busy_ns / NS_PER_S)
+                log.error("the solver has not answered for %.1f s; starting a new one in its place", busy_ns / NS_PER_S)
         busy_ms = busy_ns // NS_PER_MS // ANSWER_STEP_MS * ANSWER_STEP_MS
         return f"the solver {'has not answered' if attempt.ready.is_set() else 'has been restarting'} for {busy_ms} ms"
 
@@ -202,7 +202,7 @@ class SolverThread(SolverHost):
             attempt.error, attempt.busy_since_ns = error, self._clock.now_ns()
             attempt.ready.set()
             if attempt.number > 1 and not isinstance(error, PhasestackError | ThreadAbandoned):
-                log.exception("solver: restart failed")
+                log.exception("the solver could not be restarted")
             return
         self._publish(attempt, first)
         self._costs = attempt.costs.costs()
@@ -269,7 +269,7 @@ class SolverThread(SolverHost):
             try:
                 done = task(parts)
             except Exception:
-                log.exception("solver: a task failed")
+                log.exception("a task of the solver failed")
                 done = True
             attempt.busy_since_ns, attempt.is_at_task = 0, False
             if not done:

@@ -48,7 +48,7 @@ def judge(conditions: Conditions) -> tuple[State, str]:
         return State.FLAT, "; ".join(["no viewer", *late])
     remarks = [*late, *(["the picture is paused"] if conditions.paused else [])]
     if conditions.limited:
-        remarks.append(f"alignment at its limit until the next solution: {conditions.limited}")
+        remarks.append(f"the alignment has reached its limit until the next solution: {conditions.limited}")
     if conditions.eyes == "held":
         return State.HOLDING, "; ".join(["eyes lost; keeping the last position", *remarks])
     return State.TRACKING, "; ".join(["eyes seen", *remarks])
@@ -114,7 +114,7 @@ class Lateness:
     def update(self, *, presented: bool, now_ns: int) -> str:
         """Count a refresh, and return a message if the display is late, or "" if it is on time.
 
-        An example of the message is `late: 38 of 60 refreshes a second`. It is updated at most once per second.
+        An example of the message is `late: 38 of 60 refreshes per second`. It is updated at most once per second.
         """
         if self._begun_ns is None:
             self._begun_ns = now_ns
@@ -130,5 +130,5 @@ class Lateness:
         elif self._few_since_ns is None:
             self._few_since_ns = now_ns
         elif now_ns - self._few_since_ns > WINDOW_NS and (not self._told or now_ns - self._told_ns >= WINDOW_NS):
-            self._told, self._told_ns = f"late: {count} of {self._wanted:.0f} refreshes a second", now_ns
+            self._told, self._told_ns = f"late: {count} of {self._wanted:.0f} refreshes per second", now_ns
         return self._told

@@ -51,7 +51,7 @@ def choose(wanted: Wanted, predictor: Predictor, context: Callable[[], Any]) -> 
         InputError: `wanted` is `gl`, but a panel is too large for the OpenGL driver.
     """
     if predictor.on_panels(predictor.stack) is None:
-        choice = Choice(_cpu(), f"the only one for {predictor.name}")
+        choice = Choice(_cpu(), f"the only backend that supports {predictor.name}")
     elif wanted == "cpu":
         choice = Choice(_cpu(), "as configured")
     elif wanted == "gl":
@@ -88,7 +88,7 @@ def _faster(predictor: Predictor, made: Callable[[], GlBackend]) -> Choice:
         if gl_ms < cpu_ms:
             return Choice(gl, f"the faster at {times}")
     except PhasestackError as error:
-        return Choice(cpu, f"OpenGL cannot be used: {error}")
+        return Choice(cpu, f"OpenGL is not available: {error}")
     gl.close()
     return Choice(cpu, f"the faster at {times}")
 

@@ -156,7 +156,7 @@ def chain_frame(eyes_m: F64, stack: PanelStack, *, most_cell_px: int, reduction:
     cell_px = min(max(ceil(parallax_m / widest_m), 1), most_cell_px)
     per_column, column_m = per_parallax / cell_px, parallax_m / cell_px
     if column_m < 1e-12:
-        raise ValueError("the eyes have no horizontal separation: one is behind, above or at the other")
+        raise ValueError("the eyes have no horizontal separation as seen from the display")
     half_columns = window.half_width_m / column_m * (atanh(line.nearness) / line.nearness if line.nearness else 1.0)
     cells = min(CELLS_MAX, CELLS_STEP * ceil((ceil(half_columns / cell_px) + 1) / CELLS_STEP))
     middle_column = cells * cell_px
@@ -168,7 +168,7 @@ def chain_frame(eyes_m: F64, stack: PanelStack, *, most_cell_px: int, reduction:
     height_m, level_rows = max(reached_m) - min(reached_m), stack.height_px / reduction
     share = height_m / window.height_m
     if level_rows * share > ROWS_MAX:
-        raise ValueError(f"implausible eye positions: their raster would be {share:.0f} times as high as the panels")
+        raise ValueError(f"implausible eye positions would need a raster {share:.0f} times as high as the panels")
     row_m = max(window.height_m, height_m / ROWS_SHARE) / level_rows
     if height_m - window.height_m > 0.01 * row_m:
         rows = ROWS_STEP * ceil(height_m / row_m / ROWS_STEP)

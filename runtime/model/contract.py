@@ -24,7 +24,7 @@ class Step(Section):
 
     size: Annotated[float, Field(gt=0, le=3)] = 1.0
     momentum: Annotated[float, Field(ge=0, lt=1)] = Field(
-        0.7, description="momentum: fraction of a step's update carried into the next step"
+        0.7, description="fraction of a step's update to carry into the next step"
     )
     floor: Annotated[float, Field(gt=0, le=1)] = Field(
         0.1, description="lower limit of the squared slope of an eye's intensity"
@@ -70,21 +70,21 @@ class Contract(Section):
     output: Literal["panels", "outer"]
     branch: Literal[1, 2]
     value_range: tuple[float, float]
-    trained_for: TrainedFor | None = Field(description="null: unknown or untrained")
+    trained_for: TrainedFor | None = Field(description="null if unknown or untrained")
     recipe_sha256: str
-    width_px: Annotated[int, Field(ge=0, le=16384)] = Field(0, description="fixed input width; 0: any")
-    height_px: Annotated[int, Field(ge=0, le=16384)] = Field(0, description="fixed input height; 0: any")
+    width_px: Annotated[int, Field(ge=0, le=16384)] = Field(0, description="fixed input width; 0 for any")
+    height_px: Annotated[int, Field(ge=0, le=16384)] = Field(0, description="fixed input height; 0 for any")
     inputs: Annotated[tuple[Port, ...], Field(min_length=1, max_length=32)]
     outputs: Annotated[tuple[Port, ...], Field(min_length=1, max_length=32)]
-    graph_sha256: str = Field("", description="SHA-256 of the file without its metadata; empty: not stated")
+    graph_sha256: str = Field("", description="SHA-256 of the file without its metadata; empty if not stated")
     precision: Literal["fp32", "fp16", "int8"] = "fp32"
     parameters: Annotated[int, Field(ge=0)] = 0
     cell_px: Annotated[int, Field(ge=1, le=64)] = Field(
-        4, description="chain: the outer panels' parallax in columns of the network's raster"
+        4, description="for `chain`: the outer panels' parallax in columns of the network's raster"
     )
-    reduction: Literal[1, 2, 4] = Field(2, description="chain: factor by which a panel's raster is divided")
+    reduction: Literal[1, 2, 4] = Field(2, description="for `chain`: factor by which a panel's raster is divided")
     picture_fov_deg: Annotated[float, Field(ge=0, lt=180)] = Field(
-        0.0, description="horizontal field of view of the training pictures, black outside; 0: unlimited"
+        0.0, description="horizontal field of view of the training pictures, which are black outside; 0 for unlimited"
     )
     steps: Steps = ()
 
@@ -100,15 +100,19 @@ def parse_contract(metadata: dict[str, str], *, source: str | Path) -> Contract:
     """
     text = metadata.get(METADATA_KEY)
     if text is None:
-        raise InputError(source, METADATA_KEY, "the model has no contract, so it was not made for phasestack")
+        raise InputError(source, METADATA_KEY, "the model has no contract; export it with `phasestack export`")
     try:
         table: Any = json.loads(text)
     except RecursionError:
-        raise InputError(source, METADATA_KEY, "malformed: nested too deep") from None
+        raise InputError(source, METADATA_KEY, "malformed: nested too deeply") from None
     except ValueError as error:
         raise InputError(source, METADATA_KEY, f"malformed: {error}") from None
     if not isinstance(table, dict):
         raise InputError(source, METADATA_KEY, "must be one JSON object")
     if table.get("version") != VERSION:
-        raise InputError(source, f"{METADATA_KEY}.version", f"{table.get('version')!r} is unknown, not {VERSION}")
+        raise InputError(
+            source,
+            f"{METADATA_KEY}.version",
+            f"must be {VERSION}, not {table.get('version')!r}; export the model again",
+        )
     return validated(Contract, table, source=source)

@@ -46,9 +46,17 @@ class PictureProposal:
             (contract.height_px, stack.height_px, "height_px"),
         ):
             if given and given != wanted:
-                raise InputError(source, f"contract.{name}", f"is {given}, but the panels have {wanted}")
+                raise InputError(
+                    source,
+                    f"contract.{name}",
+                    f"is {given}, but the panels have {wanted}; export the model for this size",
+                )
         if contract.layout != "NCHW":
-            raise InputError(source, "contract.layout", f"{contract.layout} does not fit {contract.input_frame}")
+            raise InputError(
+                source,
+                "contract.layout",
+                f"{contract.layout} cannot be used with the input frame {contract.input_frame}",
+            )
         self._panels = range(stack.count) if contract.input_frame == "panel" else (stack.count // 2,)
         self._order = (0, 1) if contract.eye_order == "left-right" else (1, 0)
         channels = len(self._panels) * 2 * 3
@@ -71,7 +79,7 @@ class PictureProposal:
         name, answered, shape = contract.outputs[0].name, self._answered, self._answer
         answer = self.session.run({contract.inputs[0].name: self._input}, {name: shape})[name]
         if not np.isfinite(answer.sum()):
-            raise ModelFailure("the network's output is not finite")
+            raise ModelFailure("the network's output contains values that are not finite")
         watch.lap("inference")
         values = np.rint(np.clip(answer[0].reshape(len(answered), 3, *shape[2:]), 0, 1) * FULL).astype(np.int16)
         return {

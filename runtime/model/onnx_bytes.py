@@ -77,7 +77,7 @@ def _refers_to_a_file(message: str, data: memoryview, depth: int) -> bool:
             for number, value, _ in fields(data)
         )
     if not depth:
-        raise ValueError("nests too deep")
+        raise ValueError("is nested too deeply")
     parts = PARTS[message]
     within = ((parts[number], value) for number, value, _ in fields(data) if number in parts)
     return any(

@@ -30,7 +30,7 @@ def model_path(name: str) -> Path | None:
         return Path(str(resources.files("runtime.model") / "data" / f"{name}.onnx"))
     path = Path(name)
     if path.suffix != ".onnx" and not path.exists():
-        raise InputError("model", "name", f"{name!r} is neither {', '.join(SHIPPED)}, sart nor an ONNX file")
+        raise InputError("model", "name", f"{name!r} is not a model; use {', '.join(SHIPPED)}, sart or an ONNX file")
     return path
 
 
@@ -46,7 +46,7 @@ def shipped_sha256(name: str) -> str:
         rows = [line.split() for line in table.read_text(encoding="ascii").splitlines()]
         return {file: digest for digest, file in rows}[f"{name}.onnx"]
     except (OSError, ValueError, KeyError):
-        raise InputError(table, f"{name}.onnx", "is not listed: install phasestack again") from None
+        raise InputError(table, f"{name}.onnx", "is not listed; reinstall phasestack") from None
 
 
 def steps_from_even(steps: int) -> tuple[Step, ...]:
@@ -90,17 +90,19 @@ def load_predictor(name: str, stack: PanelStack, settings: ModelSettings | None 
     from runtime.model.solver import StepPredictor
 
     if stack.count > MAX_PANELS:
-        raise InputError("model", "name", f"{name} supports up to {MAX_PANELS} panels; use the model sart")
+        raise InputError("model", "name", f"{name} supports at most {MAX_PANELS} panels; use the model sart")
     session = ModelSession(path, provider=settings.provider, threads=settings.threads, sha256=shipped_sha256(name))
     contract = session.contract
     if name in SHIPPED and not (stack.count == 3 and stack.is_evenly_spaced):
         title = f"{name} (without its network: needs three even panels)"
         return StepPredictor(stack, None, steps_from_even(len(contract.steps)), name=title, threads=settings.threads)
     if contract.panels != stack.count:
-        raise InputError(path, "contract.panels", f"{contract.panels}, but the stack has {stack.count}")
+        raise InputError(
+            path, "contract.panels", f"is {contract.panels}, but the stack has {stack.count} panels; use the model sart"
+        )
     if contract.input_frame == "chain":
         if not stack.is_evenly_spaced:
-            raise InputError(path, "contract.panels", "needs evenly spaced panels; use the model sart")
+            raise InputError(path, "contract.panels", "the model requires evenly spaced panels; use the model sart")
         if tuple(port.name for port in contract.inputs) != INPUTS:
             raise InputError(path, "contract.inputs", f"are not {', '.join(INPUTS)}; please export the model again")
         return StepPredictor(

@@ -142,7 +142,7 @@ class ChainProposal:
         watch.lap("prepare")
         answer = self.session.run(feeds, {"rear": shape, "front": shape, "check": (1,)})
         if not np.isfinite(answer["check"]).all():
-            raise ModelFailure("the network's output is not finite")
+            raise ModelFailure("the network's output contains values that are not finite")
         watch.lap("inference")
         outer = {n: answer[name].reshape(frame.rows, -1, *left.shape[2:]) for n, name in ((0, "rear"), (2, "front"))}
         panels = parallel_map(lambda item: self._on_panel(*item, geometry, local, frame), list(outer.items()))

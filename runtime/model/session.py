@@ -59,7 +59,7 @@ class ModelSession:
         ort = onnxruntime()
         name, package = PROVIDERS[provider]
         if name not in ort.get_available_providers():
-            raise MissingPart(f"model.provider: {provider} is not installed: pip install {package}")
+            raise MissingPart(f"model.provider: {provider} is not installed; run: pip install {package}")
         options = ort.SessionOptions()
         options.intra_op_num_threads = threads
         # If the pool's threads were spinning, they would take cores from the camera and the renderer.
@@ -75,16 +75,20 @@ class ModelSession:
         except UnicodeDecodeError:
             raise InputError(path, "metadata", "is not valid UTF-8") from None
         if name not in self._session.get_providers():  # onnxruntime only prints a message and uses another one
-            problem = f"is installed but does not start: check {package} and its driver"
+            problem = f"is installed but does not start; check {package} and its driver"
             raise MissingPart(f"model.provider: {provider} {problem}")
         self.provider: str = provider
         self.fell_back = nodes_elsewhere(self._session, name)  # graph nodes that run on another provider
         if count := len(self.fell_back):
             names = ", ".join((*self.fell_back[:NODES_LOGGED], *(["..."] if count > NODES_LOGGED else [])))
-            log.warning("%s leaves %d node%s to another provider: %s", provider, count, "s" * (count != 1), names)
+            log.warning(
+                "the provider %s left %d node%s to another provider: %s", provider, count, "s" * (count != 1), names
+            )
         self.contract: Contract = parse_contract(metadata, source=path)
         if self.contract.graph_sha256 and self.contract.graph_sha256 != digest(data):
-            raise InputError(path, "contract.graph_sha256", "does not match: the file was changed after its export")
+            raise InputError(
+                path, "contract.graph_sha256", "does not match because the file was changed after its export"
+            )
         self.input_shapes = {item.name: item.shape for item in self._session.get_inputs()}
         self._types = {item.name: TYPES.get(item.type, np.float32) for item in self._session.get_outputs()}
         self._check_ports(path)
@@ -138,11 +142,15 @@ class ModelSession:
             declared = {port.name: len(port.axes) for port in ports}
             actual = {item.name: len(item.shape) for item in items}
             if declared != actual:
-                raise InputError(path, f"contract.{field}", f"declares {_named(declared)}, the graph {_named(actual)}")
+                raise InputError(
+                    path, f"contract.{field}", f"declares {_named(declared)}, but the graph has {_named(actual)}"
+                )
             for item in items:
                 if item.type not in TYPES:
                     kind = item.type.removeprefix("tensor(").removesuffix(")")
-                    problem = f"is {kind}, expected float32: only tensors inside the graph may have a lower precision"
+                    problem = (
+                        f"is {kind}, but must be float32; only tensors inside the graph may have a lower precision"
+                    )
                     raise InputError(path, f"{field}.{item.name}", problem)
 
     def check_fits(self, source: Path, feeds: Mapping[str, Shape], answers: Mapping[str, Shape]) -> None:
@@ -164,12 +172,16 @@ class ModelSession:
             ("outputs", self._session.get_outputs(), answers),
         ):
             if len(items) != len(shapes):
-                raise InputError(source, field, f"are {_list(item.name for item in items)}, must be {_list(shapes)}")
+                raise InputError(
+                    source, field, f"are {_list(item.name for item in items)}, but must be {_list(shapes)}"
+                )
             for item in items:
                 sizes, expected = item.shape, shapes[item.name]
                 fits = [size == want for size, want in zip(sizes, expected, strict=False) if isinstance(size, int)]
                 if len(sizes) != len(expected) or not all(fits):
-                    raise InputError(source, f"{field}.{item.name}", f"is {_sizes(sizes)}, expected {_sizes(expected)}")
+                    raise InputError(
+                        source, f"{field}.{item.name}", f"is {_sizes(sizes)}, but must be {_sizes(expected)}"
+                    )
                 is_open |= len(fits) < len(sizes)
         if not is_open:
             return
@@ -178,10 +190,14 @@ class ModelSession:
             got = dict(zip(answers, self._session.run(list(answers), zeros), strict=True))
         except Exception as error:  # onnxruntime's own hierarchy
             name, shape = next(iter(feeds.items()))
-            raise InputError(source, f"inputs.{name}", f"of {_sizes(shape)} fails ({_first_line(error)})") from None
+            raise InputError(
+                source, f"inputs.{name}", f"the graph fails for an input of {_sizes(shape)}: {_first_line(error)}"
+            ) from None
         for name, shape in answers.items():
             if got[name].shape != shape:
-                raise InputError(source, f"outputs.{name}", f"is {_sizes(got[name].shape)}, expected {_sizes(shape)}")
+                raise InputError(
+                    source, f"outputs.{name}", f"is {_sizes(got[name].shape)}, but must be {_sizes(shape)}"
+                )
 
 
 def nodes_elsewhere(session: Any, provider: str) -> tuple[str, ...]:
@@ -204,14 +220,16 @@ def nodes_elsewhere(session: Any, provider: str) -> tuple[str, ...]:
 def _checked(path: Path, sha256: str) -> bytes:
     data = untrusted_input.read_bytes(path, most_bytes=FILE_BYTES_MAX)
     if sha256 and hashlib.sha256(data).hexdigest() != sha256:
-        raise InputError(path, "", "is not the model that was shipped (SHA-256 differs): install phasestack again")
+        raise InputError(path, "", "is not the shipped model, because its SHA-256 differs; reinstall phasestack")
     try:
         external = has_external_data(data)
     except ValueError as error:
-        raise InputError(path, "", f"is not an ONNX model ({error})") from None
+        raise InputError(path, "", f"is not an ONNX model: {error}") from None
     if external:
-        way_out = "onnx.save(onnx.load(NAME), OTHER_NAME) combines the two"
-        raise InputError(path, "external_data", f"is not supported: the weights must be in the model file; {way_out}")
+        way_out = "combine them with onnx.save(onnx.load(NAME), OTHER_NAME)"
+        raise InputError(
+            path, "external_data", f"is not supported because the weights must be in the model file; {way_out}"
+        )
     return data
 
 
@@ -257,11 +275,11 @@ def _why_not_loaded(error: Exception) -> str:
         if found:
             what, version, most = found.groups()
             runtime = f"onnxruntime {onnxruntime().__version__}"
-            remedy = f"export it with at most {most}, or install a newer onnxruntime"
-            return f"has {what.replace('Opset', 'opset')} {version}; {runtime} supports up to {most}: {remedy}"
+            remedy = f"export the model with at most {most}, or install a newer onnxruntime"
+            return f"has {what.replace('Opset', 'opset')} {version}, but {runtime} supports at most {most}; {remedy}"
     if found := re.search(r"No Op registered for (\S+)", text):
-        return f"has an operator that onnxruntime does not know: {found[1]}"
-    return f"is not a model that onnxruntime can load ({_first_line(error)})"
+        return f"contains the operator {found[1]}, which onnxruntime does not know"
+    return f"cannot be loaded by onnxruntime: {_first_line(error)}"
 
 
 def _list(names: Iterable[str]) -> str:

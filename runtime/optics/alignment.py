@@ -180,7 +180,7 @@ def _limits(
     front_m = stack.x_m[-1]
     for name, before, after in zip(("left", "right"), solved_for_m, eyes_m, strict=True):
         room_m = before[0] - front_m - NEAREST_M
-        why = f"the {name} eye is {after[0] - front_m:.3g} m in front of the front panel; the minimum is {NEAREST_M} m"
+        why = f"the {name} eye is {after[0] - front_m:.3g} m from the front panel, but the minimum is {NEAREST_M} m"
         yield before[0] - after[0], room_m, why
         if room_m < 0.0:
             return
@@ -189,7 +189,7 @@ def _limits(
     for n, x_m in enumerate(stack.x_m):
         if x_m == reference_m:
             continue
-        why = f"the eyes are {moved_m:.3g} m from the position the layers were solved for, too far to align panel {n}"
+        why = f"the eyes are {moved_m:.3g} m from where the layers were solved for, which is too far to align panel {n}"
         distance_m, weight = old[0] - x_m, (x_m - reference_m) / (old[0] - reference_m)
         for axis, size_m in ((1, stack.width_m), (2, stack.height_m)):
             shift = abs(weight * (old[axis] * step[0] - step[axis] * distance_m))

@@ -41,10 +41,10 @@ def as_cameras(matrices: Any) -> tuple[F64, F64]:
     except (TypeError, ValueError):
         cameras = np.empty(0)
     if cameras.shape != (2, 3, 4) or not np.isfinite(cameras).all():
-        raise ValueError("must be two 3x4 matrices (left, right) that map metres in the stack's frame to pixels")
+        raise ValueError("must be a left and a right 3x4 matrix that map metres in the stack's frame to pixels")
     turns = np.linalg.det(cameras[:, :, :3])
     if not (np.abs(turns) > 0).all():
-        raise ValueError("must be cameras with a position, but their left 3x3 parts have no inverse")
+        raise ValueError("must be matrices whose left 3x3 parts have an inverse")
     cameras = cameras * np.sign(turns)[:, None, None]  # positive third coordinate in front of the camera
     places_m = -np.linalg.solve(cameras[:, :, :3], cameras[:, :, 3:])[..., 0]
     return cameras, np.asarray(np.round(places_m, DIGITS), np.float64)
@@ -89,7 +89,7 @@ def looking_at_origin(
 
     for name, matrix in zip(NAMES, pixels_from_gaze, strict=True):
         if not _within(matrix, np.zeros(2), width, height):
-            raise ValueError(f"the {name} picture does not show the centre of the stack")
+            raise ValueError(f"the {name} picture does not show the centre of the stack; aim the camera at it")
     both = _most(lambda share: shown(np.array([share, share])))
     share = np.array([both, both])
     share[0] = _most(lambda wider: shown(np.array([wider, share[1]])), least=both)
@@ -148,9 +148,11 @@ def doubts(eyes_m: ArrayLike, stack: PanelStack, *, fov_deg: float, size: tuple[
     """
     eyes, warnings = np.asarray(eyes_m, np.float64), []
     if fov_deg <= math.pi:
-        warnings.append(f"fov_deg: {fov_deg:g} degrees looks like radians ({math.degrees(fov_deg):.1f} degrees)")
+        warnings.append(
+            f"fov_deg: {fov_deg:g} degrees looks like radians; did you mean {math.degrees(fov_deg):.1f} degrees?"
+        )
     if (eyes[1] - eyes[0]) @ stack_from_eye(eyes.mean(0))[:3, 0] < 0:
-        warnings.append("eyes_m: the left eye is on the right of the right eye; are they swapped?")
+        warnings.append("eyes_m: the left eye is to the right of the right eye; swap the eyes if this is not intended")
     width_px, height_px = 64, max(2, round(64 * size[1] / size[0]))
     shares = []
     for eye in eyes:
@@ -160,7 +162,7 @@ def doubts(eyes_m: ArrayLike, stack: PanelStack, *, fov_deg: float, size: tuple[
         shares.append(float(inside.mean()))
     if 1 - min(shares) > OUTSIDE_MOST:
         warnings.append(
-            f"fov_deg: {1 - min(shares):.0%} of a picture {fov_deg:g} degrees wide, aimed at the stack's origin, "
-            "is outside the panels: if the camera was aimed elsewhere, pass its matrix"
+            f"fov_deg: {1 - min(shares):.0%} of a picture that is {fov_deg:g} degrees wide and aimed at the stack's "
+            "origin is outside the panels; if the camera was aimed elsewhere, pass its matrix"
         )
     return warnings

@@ -171,13 +171,17 @@ def disparity_doubts(
         return f"{abs(depth_mm):.0f} mm {'in front of' if depth_mm > 0 else 'behind'}"
 
     low_m, middle_m, high_m = (float(value) for value in np.percentile(found_m, (10, 50, 90)))
-    warning = "pictures: have more disparity than these gaps can show without ghosts, which are estimated at "
+    warning = "pictures: the disparity is too large for the panels' gaps and will cause ghosts, estimated at "
     warning += f"{ghosts:.0%} of full scale. The scene is {place(low_m)} to {place(high_m)} the middle panel"
     factors = LARGER ** np.arange(1, 1 + np.log(MOST_LARGER) / np.log(LARGER))
     if larger := next((float(one) for one in factors if compared.ghosts(one * unit_m) <= GHOSTS_MOST), None):
-        warning += f"; gaps {larger:.1f} times as large, or disparity divided by that factor, would avoid the ghosts"
+        warning += (
+            f"; to avoid ghosts, make the gaps {larger:.1f} times as large or divide the disparity by that factor"
+        )
     if parallel and low_m > 0:
         shift_px = middle_m / _width_m(eyes_m.mean(axis=0), fov_deg) * pictures[0].shape[1] / 2
-        warning += ". All of it is in front of that panel, as in a rectified pair from parallel cameras: pass the "
-        warning += f"cameras, or shift the left picture {shift_px:.0f} pixels left and the right one as far right"
+        warning += ". The whole scene is in front of that panel, as in a rectified pair from parallel cameras; pass "
+        warning += (
+            f"the cameras, or shift the left picture {shift_px:.0f} pixels left and the right picture as far right"
+        )
     return [warning]

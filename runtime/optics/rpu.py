@@ -31,6 +31,6 @@ def panel_from_image(image_from_stack: F64, raster: PlaneRaster) -> F64:
     terms = np.abs(image_from_stack) @ np.abs([raster.x_m, raster.left_m, raster.top_m, 1.0])
     noise = 64 * np.finfo(np.float64).eps * float(terms @ np.abs(adjugate[2]))
     if not np.isfinite(scale) or scale == 0.0 or abs(adjugate[2] @ h[:, 2]) <= noise:
-        raise ValueError("the eye is in the panel's plane: its view of the panel is singular")
+        raise ValueError("the eye is in the panel's plane, so its view of the panel is singular")
     result: F64 = adjugate / scale
     return result

@@ -58,7 +58,7 @@ def listening(command: str, port: int) -> sockets.socket:
     try:
         return sockets.create_server((LOOPBACK, port))
     except OSError as error:
-        raise InputError(command, "--port", f"cannot listen on port {port} ({error.strerror})") from None
+        raise InputError(command, "--port", f"cannot listen on port {port}: {error.strerror}") from None
 
 
 def server_of(application: Any) -> uvicorn.Server:

@@ -77,7 +77,9 @@ def application(daemon: DaemonClient, token: str, *, link: BrowserLink | None = 
     def guarded(handler: Handler) -> Handler:
         async def answer(request: Request) -> Response:
             if not permitted(request):
-                return JsonAnswer({"ok": False, "error": "not logged in"}, 401, {"WWW-Authenticate": "Bearer"})
+                return JsonAnswer(
+                    {"ok": False, "error": "not logged in; send the token"}, 401, {"WWW-Authenticate": "Bearer"}
+                )
             return await handler(request)
 
         return answer

@@ -34,7 +34,7 @@ def token_of(path: Path) -> str:
     except FileExistsError:
         pass  # created by another process in the meantime
     except OSError as error:
-        raise InputError(path, "", f"cannot be created ({error.strerror})") from None
+        raise InputError(path, "", f"cannot be created: {error.strerror}") from None
     finally:
         if name:
             Path(name).unlink(missing_ok=True)
@@ -45,16 +45,20 @@ def _read(path: Path) -> str:
     try:
         file = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK)
     except OSError as error:
-        raise InputError(path, "", f"cannot be read ({error.strerror})") from None
+        raise InputError(path, "", f"cannot be read: {error.strerror}") from None
     with os.fdopen(file, "rb") as opened:
         status = os.fstat(opened.fileno())
         if not stat.S_ISREG(status.st_mode):
             raise InputError(path, "", "is not a regular file")
         if status.st_uid != os.geteuid():
-            raise InputError(path, "", f"belongs to another user (uid {status.st_uid}), who therefore knows the token")
+            raise InputError(
+                path, "", f"belongs to another user (uid {status.st_uid}), who may know the token; delete the file"
+            )
         if status.st_mode & 0o077:
             raise InputError(
-                path, "", f"is readable by others (mode {status.st_mode & 0o777:o}); set its mode to 600 or delete it"
+                path,
+                "",
+                f"can be read by other users (mode {status.st_mode & 0o777:o}); set its mode to 600 or delete the file",
             )
         token = (opened.read(MOST_BYTES) or b"").decode("ascii", "replace").strip()
     if len(token) < LEAST_CHARACTERS or not token.isprintable() or " " in token:

@@ -97,9 +97,9 @@ def _connect() -> None:
             glfw.init_hint(glfw.PLATFORM, glfw.PLATFORM_X11)
         glfw.init()
     except glfw.GLFWError as error:
-        raise PanelLost(f"no X server can be reached: {_text(error)} (check DISPLAY and XAUTHORITY)") from None
+        raise PanelLost(f"no X server is available: {_text(error)}; check DISPLAY and XAUTHORITY") from None
     if glfw.get_platform() != glfw.PLATFORM_X11:
-        raise MissingPart("GLFW does not use X11, which is required to place a window on a chosen monitor")
+        raise MissingPart("GLFW does not use X11, but placing windows on monitors requires X11; start an X server")
     xlib.take_over_errors()
     watch = xlib.ServerWatch(_pointer())
 

@@ -31,7 +31,7 @@ def measured_curve(path: Path) -> F32:
     lines = [line for line in untrusted_input.read_text(path).splitlines() if line.strip() and line[0] != "#"]
     header = tuple(name.strip().lower() for name in lines[0].split(",")) if lines else ()
     if header not in (COLUMNS, ("phase", "grey")):
-        raise InputError(path, "columns", "must have the columns phase, red, green, blue (or phase, grey)")
+        raise InputError(path, "columns", "must have the columns phase, red, green and blue, or phase and grey")
     if len(lines) < 3:
         raise InputError(path, "phase", "must have at least two rows")
     try:
@@ -41,7 +41,7 @@ def measured_curve(path: Path) -> F32:
     if not np.isfinite(table).all() or table.min() < 0.0 or table.max() > 1.0:
         raise InputError(path, "values", "must be in [0, 1]")
     if (np.diff(table[:, 0]) <= 0.0).any():
-        raise InputError(path, "phase", "must ascend")
+        raise InputError(path, "phase", "must increase from row to row")
     phases = np.linspace(0.0, 1.0, ENTRIES)
     greys = table[:, 1:] if table.shape[1] == 4 else np.repeat(table[:, 1:2], 3, axis=1)
     return np.stack([np.interp(phases, table[:, 0], greys[:, channel]) for channel in range(3)], axis=1).astype(

@@ -99,13 +99,13 @@ def _find(number: int, panel: PanelSettings, monitors: tuple[Monitor, ...]) -> M
         raise InputError(
             "output",
             f"panels.{number}",
-            "names no monitor; set edid_serial or connector as shown by `phasestack identify`",
+            "does not name a monitor; set edid_serial or connector as shown by `phasestack identify`",
         )
     if len(matches) == 1:
         return matches[0]
     connected = "; ".join(str(monitor) for monitor in monitors) or "none"
-    problem = "no monitor" if not matches else f"{len(matches)} monitors"
-    raise PanelLost(f"panel {number}: {problem} with {' and '.join(criteria)} (connected: {connected})")
+    problem = "no monitor has" if not matches else f"{len(matches)} monitors have"
+    raise PanelLost(f"panel {number}: {problem} {' and '.join(criteria)}; connected monitors: {connected}")
 
 
 def check_modes(panels: Sequence[PanelSettings], monitors: Sequence[Monitor], *, width_px: int, height_px: int) -> None:
@@ -119,9 +119,9 @@ def check_modes(panels: Sequence[PanelSettings], monitors: Sequence[Monitor], *,
         )
         if (columns, rows) != (width_px, height_px):
             raise PanelLost(
-                f"panel {number}: {monitor.connector} shows {columns}x{rows} (mounted at {panel.rotation_deg} degrees),"
-                f" but the stack is {width_px}x{height_px}. Change its mode or rotation_deg, or stack.width_px "
-                "and height_px"
+                f"panel {number}: {monitor.connector} shows {columns}x{rows} at {panel.rotation_deg} degrees,"
+                f" but the stack has {width_px}x{height_px} pixels; change the mode, rotation_deg, or "
+                "stack.width_px and height_px"
             )
 
 

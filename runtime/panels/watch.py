@@ -73,7 +73,7 @@ class PlacementWatch:
         is_viewable, place = state
         if not is_viewable:
             return f"panel {panel}: the window was unmapped"
-        return "" if place == bound else f"panel {panel}: the window is {place}, not {bound}"
+        return "" if place == bound else f"panel {panel}: the window is at {place}, but must be at {bound}"
 
     def _monitor_fault(self, panel: int) -> str:
         monitor, then = self._monitors[panel], self._states[panel]

@@ -156,7 +156,7 @@ class WindowPanels(PanelSink):
         context.finish()
         if fault := _reset_status() or _error(context):
             self._context_lost = True
-            raise PanelLost(f"the GL context of panel {panel}: {fault}")
+            raise PanelLost(f"the OpenGL context of panel {panel} failed: {fault}")
 
     def _swap(self, window: Window) -> int:
         window.make_current()
@@ -211,7 +211,7 @@ class WindowPanels(PanelSink):
                 self._textures.release()
             display.close_windows()
         except Exception:
-            log.exception("closing windows")
+            log.exception("error while closing the windows")
             self._drop()
         self._forget()
 
@@ -225,7 +225,7 @@ class WindowPanels(PanelSink):
             try:
                 display.close()
             except Exception:
-                log.exception("closing the display")
+                log.exception("error while closing the display")
 
     def _forget(self) -> None:
         """Clear all state kept for the closed windows, and schedule reopening them."""
@@ -248,7 +248,7 @@ def _reset_status() -> str:
     """Return the driver's status after a GPU reset, or "" if the GPU has not been reset."""
     address = gl_function("glGetGraphicsResetStatus")
     status: int = ctypes.CFUNCTYPE(ctypes.c_uint)(address)() if address else 0
-    return f"was reset (0x{status:x})" if status else ""
+    return f"the driver reset the GPU (0x{status:x})" if status else ""
 
 
 def every_monitor() -> tuple[WindowPanels, list[U8], tuple[Monitor, ...]]:
@@ -269,7 +269,7 @@ def every_monitor() -> tuple[WindowPanels, list[U8], tuple[Monitor, ...]]:
     panels = WindowPanels(bound, stack, MonotonicClock(), offscreen_context(), any_shape=True)
     cards = []
     for monitor in monitors:
-        lines = [monitor.model or "(no name in its EDID)", f"{monitor.width_px} x {monitor.height_px}",
+        lines = [monitor.model or "(the EDID has no name)", f"{monitor.width_px} x {monitor.height_px}",
                  "in the configuration:", "[[output.panels]]", monitor.setting]  # fmt: skip
         cards.append(identity_card(width, height, title=monitor.connector, lines=lines))
     return panels, cards, monitors

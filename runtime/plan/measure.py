@@ -160,10 +160,12 @@ def _check_viewer(eyes_m: F64, stack: PanelStack, *, fov_deg: float) -> None:
     nearest_m = float(eyes_m[:, 0].min())
     if nearest_m <= max(stack.x_m):
         raise InputError(
-            "sensor.fixed_eyes_m", "", f"x = {nearest_m:g} m : not in front of the panels (x > {max(stack.x_m):g} m)"
+            "sensor.fixed_eyes_m",
+            "",
+            f"x = {nearest_m:g} m is not in front of the panels; x must exceed {max(stack.x_m):g} m",
         )
     # A coarse raster is enough to find out if the display is visible.
     coarse = replace(stack, width_px=64, height_px=36)
     blank = np.zeros((stack.count, coarse.height_px, coarse.width_px, 3), np.uint8)
     if not any(seen_by(eye_m, blank, coarse, fov_deg=fov_deg).mask.any() for eye_m in eyes_m):
-        raise InputError("sensor.fixed_eyes_m", "", "no part of the display is visible from there")
+        raise InputError("sensor.fixed_eyes_m", "", "these eyes cannot see any part of the display")

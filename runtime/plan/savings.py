@@ -122,18 +122,22 @@ def make_plan(
         seeing = (True, True)
     items: list[PlanItem] = []
     if on and not info.moving:
-        why = "the content stands still; as long as the head rests, the same solution is shown"
+        why = "the content does not move, so the same solution is shown while the head rests"
         items.append(_item("render and inference", why, numbers.reuse))
     if on:
         items += network_items(info, numbers)
     if seeing != (True, True):
         side = "right" if seeing[0] else "left"
-        items.append(_item(f"the {side} eye", f"it is over {VISIBLE_DEG:g} degrees off the axis", numbers.one_eye))
+        items.append(
+            _item(f"the {side} eye", f"this eye is more than {VISIBLE_DEG:g} degrees off the axis", numbers.one_eye)
+        )
     if settings.sensor.driver == "fixed":
-        items.append(_item("the sensor", "the eyes' position is given (sensor.driver = fixed)", Saving()))
+        items.append(_item("the sensor", "the setting sensor.driver = fixed gives the position of the eyes", Saving()))
     absent = [name for name in OPTIONAL_PARTS if name not in loaded_modules]
     if absent:
-        why = "not needed here, not imported: " + ", ".join(f"{name} ({OPTIONAL_PARTS[name]})" for name in absent)
+        why = "these modules are not needed and were not imported: " + ", ".join(
+            f"{name} ({OPTIONAL_PARTS[name]})" for name in absent
+        )
         items.append(_item("optional parts", why, Saving()))
     return Plan(seeing, tuple(items))
 
@@ -142,13 +146,13 @@ def network_items(info: ContentInfo, numbers: Measured) -> list[PlanItem]:
     """Return the plan items for work that the model skipped in the newest job (`Measured.left_out`)."""
     items, share = [], numbers.left_out.solved_share
     if info.flat_x_m is not None and share == 0.0:
-        why = "everything lies in the centre panel's plane: both eyes see the same"
+        why = "everything is in the centre panel's plane, so both eyes see the same picture"
         items.append(_item("inference", why, numbers.focus))
     elif share < 1.0:
-        why = f"the two eyes differ on {share:.0%} of the panel; the rest is filled in closed form"
+        why = f"the two eyes differ on {share:.0%} of the panel; the rest has a closed-form solution"
         items.append(_item("inference outside the active window", why, numbers.focus))
     if numbers.left_out.channels == 1:
-        why = "the pictures are grey: one channel is solved for all three"
+        why = "the pictures are grey, so one channel is solved for all three"
         items.append(_item("two of three colour channels", why, numbers.one_channel))
     return items
 

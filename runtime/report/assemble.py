@@ -20,7 +20,7 @@ from runtime.report.page import Page, PageSection, describe
 from runtime.report.pairs import StillPair, procedural_pairs, read_pairs
 from runtime.report.sections import focal_section, frontier_section, moving_section
 
-QUOTE = "light_db at a tracking error of 1 mm: mean light over both eyes' pupils and pixels; for motion live_db"
+QUOTE = "light_db at a tracking error of 1 mm, the mean over both eyes' pupils and pixels; for motion, live_db"
 Progress = Callable[[str], None]
 
 
@@ -55,9 +55,13 @@ class GrowingPage:
     def write(self) -> None:
         """Write all results measured so far. Raises InputError if the files cannot be written."""
         doing = self.record.get("measuring")
-        notes = [f"Not finished: this page grows as figures come in. Last known step: {doing}."] if doing else []
+        notes = (
+            [f"This report is not finished and grows as results come in. The last known step is: {doing}."]
+            if doing
+            else []
+        )
         if busy := too_busy(self.record["yardsticks_ms"]):
-            notes.append(f"The machine was busy ({busy}), so do not compare these times or their ratios.")
+            notes.append(f"Do not compare these times or their ratios, because the machine was busy: {busy}.")
         sections, machine = list(self._sections.values()), self.record["machine"]
         lead = "Quote the light at a tracking error of 1 mm. Higher is better."
         page = Page("Light against run time", lead, sections, machine, self._command, notes)
@@ -128,7 +132,7 @@ def _frontier(
     page.doing(f"{title}: drawing")
     before, results = page.record.get(key, []), dict[str, MethodResult]()
     for done, result in measure(methods, pairs, viewers=page.out):
-        page.doing(f"{title}: {done} is done")
+        page.doing(f"{title}: finished {done}")
         page.record["yardsticks_ms"].append(yardstick_ms())
         results[result.name] = result
         page.record[key] = before + [asdict(one) for one in results.values()]
@@ -146,7 +150,7 @@ def _moving(page: GrowingPage, *, quick: bool) -> None:
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         done = pool.map(lambda run: apart(measure, *run), runs)
         for result in done:
-            page.doing(f"what a moving viewer sees: {result.motion}, {result.effort} is done")
+            page.doing(f"what a moving viewer sees: finished {result.motion} with effort {result.effort}")
             results.append(result)
             page.record["moving"] = [asdict(one) for one in results]
             page.put("moving", moving_section(results))

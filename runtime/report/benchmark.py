@@ -115,7 +115,7 @@ def measured(
         with PairPainter("demo", stack) as painter:
             pair = painter.pair("demo", eyes_at(distance_m=0.6, height_m=0.05), stack, fov_deg=FOV_DEG, off_mm=())
         for done, result in measure(methods, [pair]):
-            progress(f"{width}x{height}: {done} is done")
+            progress(f"{width}x{height}: finished {done}")
             yardsticks.append(yardstick_ms())
             entries.append(_entry(result))
     return {
@@ -161,7 +161,7 @@ def compare(old: RegressionFile, new: RegressionFile) -> list[Change]:
         if comparable:
             noise = max(SLOWER, SCATTERS * float(np.hypot(before.scatter, after.scatter)))
             ratio = after.ms_p50 / before.ms_p50 / machine
-            changes += _times(name, ratio, noise, f"the time of a solution (noise {noise:.0%})")
+            changes += _times(name, ratio, noise, f"the solution time (noise {noise:.0%})")
         changes += _times(name, after.memory_mib / before.memory_mib, MORE_MEMORY, "the memory")
         for label, gain in _gains(before, after):
             if abs(gain) > WORSE_DB:
@@ -176,6 +176,6 @@ def _times(name: str, ratio: float, noise: float, of_what: str) -> list[Change]:
 
 def _gains(before: BenchEntry, after: BenchEntry) -> Iterator[tuple[str, float]]:
     for sigma in sorted(before.light_db.keys() & after.light_db.keys()):
-        yield f"of light, at a tracking error of {sigma} mm", after.light_db[sigma] - before.light_db[sigma]
-    yield "one ray a pixel", after.psnr_db - before.psnr_db
-    yield "one ray a pixel, at the worse eye", after.worst_eye_psnr_db - before.worst_eye_psnr_db
+        yield f"of light PSNR at a tracking error of {sigma} mm", after.light_db[sigma] - before.light_db[sigma]
+    yield "of PSNR with one ray per pixel", after.psnr_db - before.psnr_db
+    yield "of PSNR with one ray per pixel at the worse eye", after.worst_eye_psnr_db - before.worst_eye_psnr_db

@@ -176,7 +176,7 @@ def apart(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         try:
             return pool.submit(_called, function, args, kwargs).result()
         except BrokenProcessPool:
-            raise FatalError(f"{function.__name__}: the measuring process has died") from None
+            raise FatalError(f"{function.__name__}: the measuring process died unexpectedly") from None
 
 
 def _called(function: Callable[..., T], args: Any, kwargs: Any) -> T:

@@ -111,6 +111,6 @@ def moving_run(
     view_error_mm, live_db = summary["view_error_mm"], summary["live_db"]
     name = effort.name if effort else "auto"
     if view_error_mm is None or live_db is None:
-        raise FatalError(f"the motion {motion} with the effort {name} gave no measurement")
+        raise FatalError(f"the run with the motion {motion} and the effort {name} produced no measurement")
     both_mm = view_error_mm["p50"], view_error_mm["p95"]
     return Moving(motion, name, live_db, both_mm, summary["efforts"], summary["live_frames"])

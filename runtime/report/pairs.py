@@ -81,7 +81,7 @@ def read_pairs(folder: Path) -> list[StillPair]:
         if {"panels", "eyes", "images"} <= table.keys():
             pairs.append(_case(path, table))
     if not pairs:
-        raise InputError(folder, "", "contains no case file (JSON with panels, eyes, images, fov)")
+        raise InputError(folder, "", "contains no case file; a case file is JSON with panels, eyes, images and fov")
     return pairs
 
 
@@ -89,7 +89,9 @@ def _case(path: Path, table: dict[str, Any]) -> StillPair:
     case = validated(CaseFile, table, source=path)
     left, right = (read_image(path.parent / name) for name in case.images)
     if left.shape != right.shape:
-        raise InputError(path, "images", f"differ in size: {left.shape[1::-1]} and {right.shape[1::-1]}")
+        raise InputError(
+            path, "images", f"must have the same size, but have {left.shape[1::-1]} and {right.shape[1::-1]}"
+        )
     size = {"width_px": left.shape[1], "height_px": left.shape[0]}
     stack = validated(StackGeometry, size | case.panels, source=f"{path}: panels").stack()
     eyes = np.array(case.eyes)
@@ -99,7 +101,7 @@ def _case(path: Path, table: dict[str, Any]) -> StillPair:
     for view in case.off:
         image = read_image(path.parent / view.image)
         if image.shape != left.shape:
-            raise InputError(path.parent / view.image, "", "differs in size from the pair")
+            raise InputError(path.parent / view.image, "", "must have the same size as the pair")
         off.append(OffView(view.mm, np.array(view.eye), image))
     return StillPair(path.stem, stack, eyes, (left, right), case.fov, tuple(off))
 

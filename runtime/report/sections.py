@@ -26,10 +26,10 @@ def frontier_section(results: Sequence[MethodResult], *, title: str, name: str) 
     """
     pairs = "; ".join(pair.pair for pair in results[0].pairs)
     text = [
-        f"Every method on {pairs}, in one run. Light is the figure to quote: panel pixels are squares, pupils 4 mm "
-        "wide, the tracking error 1 mm. Published evaluations measure one ray a pixel, sampled bilinearly. The time is "
-        "that of a whole solution, from two decoded pictures to 8-bit layers. Each method runs in a separate process, "
-        "whose peak is its memory."
+        f"Every method was measured on {pairs} in one run. Quote the light PSNR, which assumes square panel pixels, "
+        "pupils 4 mm wide and a tracking error of 1 mm. Published evaluations trace one ray per pixel, sampled "
+        "bilinearly. The time covers a whole solution, from two decoded pictures to 8-bit layers. Each method runs in "
+        "a separate process, and its memory is the peak of that process."
     ]
     links = [(f"Viewer: {pair.pair}, {results[0].name}", pair.viewer) for pair in results[0].pairs if pair.viewer]
     return PageSection(title, text, [frontier_plot(results, name=f"frontier-{name}")], [method_table(results)], links)
@@ -69,7 +69,7 @@ def frontier_plot(results: Sequence[MethodResult], *, name: str) -> Figure:
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_formatter("")
         axes.legend()
-    told = "Times depend on this machine and its load: compare ratios. Bars: eight runs in ten. Dots: single pairs."
+    told = "Times depend on this machine and its load; compare ratios. Bars: eight runs in ten. Dots: single pairs."
     return Figure(name, png(figure), told)
 
 
@@ -102,7 +102,7 @@ def method_table(results: Sequence[MethodResult]) -> Table:
         times = [f"{r.ms_p50 / ordered[0].ms_p50:.1f}", f"{r.ms_p50:.1f}", f"{r.ms_p99:.1f}"]
         rows.append([r.name, *times, f"{r.memory_mib:.0f}", f"{r.parameters:,}", *told])
     size = f"{ordered[0].width_px}x{ordered[0].height_px}"
-    caption = f"Panels of {size}. The worst eye is that of all pairs, one ray a pixel: compare it with one ray."
+    caption = f"Panels of {size}. The worst eye is the worst of all pairs with one ray per pixel."
     return Table(headings, rows, caption)
 
 
@@ -110,15 +110,15 @@ def moving_section(found: Sequence[Moving]) -> PageSection:
     """Return a section with the live quality and view error for each motion and effort measured so far."""
     costs = ", ".join(f"{stage} {ms}" for stage, ms in COSTS_MS.items())
     text = [
-        "A solution takes longer than a refresh, and the head keeps moving. At every refresh the outer panels are "
-        "shifted and scaled to the eyes, which removes ghosts but not the age of the view. Live quality counts both: "
-        "the light at the true eyes against what they should see from there at that refresh. The view error is the "
-        "distance from the true eyes to those that the layers were solved for.",
-        "An effort is a raster and a number of steps: 1/2+1 has half the rows and columns, and one step. Fixed, every "
-        "solution has it; auto is the loop's own choice. These are the daemon's own runs on the simulated clock, which "
-        f"takes for a solution on the full raster (ms): {costs}; a coarser one costs less as it has fewer pixels. "
-        f"Heads at 0.6 m, 30 samples a second, {NOISE_MM} mm of noise, outliers and dropouts, {SECONDS:g} s, seed "
-        f"{SEED}; film: the content moves and the head rests.",
+        "A solution takes longer than a refresh, and the head keeps moving. At every refresh, the outer panels are "
+        "shifted and scaled to the eyes, which removes ghosts but does not update the view. Live quality measures "
+        "both: it compares the light at the true eyes with what they should see at that refresh. The view error is the "
+        "distance from the true eyes to the eyes that the layers were solved for.",
+        "An effort is a raster and a number of steps: 1/2+1 has half the rows and columns and one step. A fixed effort "
+        "applies to every solution; with auto, the loop chooses. The daemon ran on the simulated clock, on which a "
+        f"solution at the full raster takes these times in ms: {costs}. Coarser rasters take less in proportion to "
+        f"their pixels. The head was at 0.6 m, with 30 samples per second, {NOISE_MM} mm of noise, outliers and "
+        f"dropouts, for {SECONDS:g} s with seed {SEED}. In the motion film, the content moves and the head rests.",
     ]
     headings = ["motion", "effort", "live dB", "view error p50 mm", "p95 mm", "on the panels"]
     rows = [
@@ -159,7 +159,9 @@ def moving_plot(found: Sequence[Moving]) -> Figure:
         )
         below.yaxis.set_major_formatter("{x:g}")
         below.set_xticks(range(len(efforts)), efforts)
-    told = "Live quality and view error with fixed efforts, slowest first, and with the loop's choice (stars, dotted)."
+    told = (
+        "Live quality and view error with fixed efforts, slowest first, and the loop's choice (stars and dotted lines)."
+    )
     return Figure("moving-viewer", png(figure), told)
 
 
@@ -172,11 +174,13 @@ def focal_section(stack: FocalStack) -> PageSection:
         conflict = abs(1 / card.card_m - 1 / card.sharpest_shown_m)
         rows.append([name, *(f"{1000 * place:.0f}" for place in places_m), f"{conflict:.3f}"])
     text = [
-        f"Three cards, 5 cm behind, in and 4.5 cm in front of the middle panel, seen from {DISTANCE_M:g} m by a pupil "
-        f"of {1000 * PUPIL_M:g} mm. The layers ({stack.model}) are solved for two pinhole eyes only; the rest of the "
-        "pupil had no target. On a flat panel every card is sharpest in the panel's plane at any depth."
+        f"Three cards are 5 cm behind, in and 4.5 cm in front of the middle panel. They are seen from {DISTANCE_M:g} m "
+        f"by a pupil of {1000 * PUPIL_M:g} mm. The layers (model {stack.model}) were solved for two pinhole eyes only, "
+        "without a target for the rest of the pupil. On a flat panel, every card is sharpest in the panel's plane."
     ]
-    caption = "Vergence against accommodation, right eye: up to 0.3 dioptres are commonly considered comfortable."
+    caption = (
+        "Vergence against accommodation for the right eye. Up to 0.3 dioptres are commonly considered comfortable."
+    )
     table = Table([*headings, "conflict, dioptres"], rows, caption)
     return PageSection("Focal parallax", text, [slice_picture(stack)], [table])
 

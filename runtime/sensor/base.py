@@ -116,7 +116,7 @@ class SteppedSensor(Sensor):
         Raises SensorLost if the driver is not open.
         """
         if self._frames is None:
-            raise SensorLost(f"{self._source}: not open")
+            raise SensorLost(f"{self._source}: the recording is not open")
         return self._next
 
     def next_sample(self) -> SensorFrame:

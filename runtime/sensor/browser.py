@@ -45,7 +45,7 @@ class BrowserEyes(Sensor):
 
     def read_arrived(self, timeout_s: float) -> list[SensorFrame]:
         if self._waiting is None:
-            raise SensorLost("not open")
+            raise SensorLost("the browser's sensor is not open")
         while True:
             now_ns = self._clock.now_ns()
             due = []

@@ -25,7 +25,7 @@ class FixedDriver(SteppedSensor):
     def __init__(self, settings: SensorSettings, clock: Clock) -> None:
         """Store the eye positions. Raises InputError if the settings contain no eye positions."""
         if settings.fixed_eyes_m is None:
-            raise InputError("sensor", "fixed_eyes_m", "is required by the driver `fixed`")
+            raise InputError("sensor", "fixed_eyes_m", "must be set for the driver `fixed`")
         super().__init__(self.name, clock)
         self._eyes = EyePoints(np.array(settings.fixed_eyes_m, dtype=np.float64), np.ones(2))
 

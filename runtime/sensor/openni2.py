@@ -82,7 +82,7 @@ class OpenNI2Driver(Sensor):
     def _open(self) -> None:
         source = self._settings.source
         if source.endswith(".oni") and not Path(source).is_file():
-            raise InputError(source, "", "cannot be read")
+            raise InputError(source, "", "does not exist or is not a file")
         self._openni = load(self._settings.openni2_folder)
         try:
             self._device = self._find_device()
@@ -110,15 +110,19 @@ class OpenNI2Driver(Sensor):
         for device in matches:
             device.close()
         if matches:
-            raise SensorLost(f"{len(matches)} OpenNI2 cameras match sensor.source; set it to a serial number")
-        raise SensorLost(f"no OpenNI2 camera {wanted!r} among {len(uris)}" if wanted else "no OpenNI2 camera found")
+            raise SensorLost(f"{len(matches)} OpenNI2 cameras match; set sensor.source to a serial number")
+        raise SensorLost(
+            f"no OpenNI2 camera {wanted!r} found among {len(uris)} connected cameras"
+            if wanted
+            else "no OpenNI2 camera found"
+        )
 
     def _start_streams(self) -> None:
         device, openni = self._device, self._openni
         streams = {"depth": device.create_depth_stream(), "colour": device.create_color_stream()}
         self._streams = {kind: stream for kind, stream in streams.items() if stream is not None}
         if not self._streams:
-            raise SensorLost("the camera delivers neither depth nor colour")
+            raise SensorLost("OpenNI2: the camera delivers neither depth nor colour")
         both = len(self._streams) == 2
         mode = openni.IMAGE_REGISTRATION_DEPTH_TO_COLOR
         if both and device.is_image_registration_mode_supported(mode):
@@ -158,7 +162,7 @@ class OpenNI2Driver(Sensor):
 
     def read_newest(self, timeout_s: float) -> SensorFrame:
         if self._thread is None:
-            raise SensorLost("not open")
+            raise SensorLost("OpenNI2: the camera is not open")
         return self._thread(lambda: self._read_newest(timeout_s))
 
     def _read_newest(self, timeout_s: float) -> SensorFrame:

@@ -27,7 +27,7 @@ LIBRARY_FOLDERS = (
     "/usr/local/lib",
 )
 DUMMY = "DummyDevice"  # OpenNI2's sample driver, which would add a fake device
-INSTALL = "OpenNI2 was not found; install it (Debian: apt install libopenni2-0) or set sensor.openni2_folder"
+INSTALL = "OpenNI2 was not found; install libopenni2-0 or set sensor.openni2_folder"
 
 _lock = threading.Lock()
 _loaded = False
@@ -81,7 +81,7 @@ def load(folder: str = "") -> Any:
         try:
             openni2.initialize(str(links))
         except Exception as error:
-            raise SensorLost(f"OpenNI2 cannot be started: {error}") from None
+            raise SensorLost(f"OpenNI2 failed to start: {error}") from None
         for file in (links / "OpenNI2" / "Drivers").iterdir():
             ctypes.CDLL(str(file), mode=os.RTLD_NOW | os.RTLD_NODELETE)
         _loaded = True

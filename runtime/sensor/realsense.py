@@ -63,7 +63,7 @@ class RealSenseDriver(Sensor):
         try:
             if source.endswith(FILES):
                 if not Path(source).is_file():
-                    raise InputError(source, "", "cannot be read")
+                    raise InputError(source, "", "does not exist or is not a file")
                 config.enable_device_from_file(source, repeat_playback=self._settings.loop)
             else:
                 config.enable_device(self._serial_to_open())
@@ -94,15 +94,15 @@ class RealSenseDriver(Sensor):
         matches = [serial for serial in serials if configured in ("", serial)]
         if len(matches) > 1:
             choices = ", ".join(matches)
-            raise SensorLost(f"several RealSense cameras found; set sensor.source to one of {choices}")
+            raise SensorLost(f"several RealSense cameras are connected; set sensor.source to one of {choices}")
         if not matches:
             camera = f"RealSense camera {configured!r}" if configured else "RealSense camera"
-            raise SensorLost(f"no {camera} is connected ({len(serials)} others)")
+            raise SensorLost(f"no {camera} found among {len(serials)} connected cameras")
         return matches[0]
 
     def read_newest(self, timeout_s: float) -> SensorFrame:
         if self._pipeline is None:
-            raise SensorLost("not open")
+            raise SensorLost("RealSense: the camera is not open")
         deadline_ns = self._clock.now_ns() + round(timeout_s * NS_PER_S)
         try:
             frames = self._next(deadline_ns)
@@ -189,7 +189,7 @@ def _rgb(frame: Any) -> U8:
     """Copy a colour frame as (h, w, 3) RGB. Raises SensorLost if its format is not in `COLOURS`."""
     kind = frame.profile.format().name
     if kind not in COLOURS:
-        raise SensorLost(f"RealSense: colour format {kind} is not supported ({', '.join(COLOURS)})")
+        raise SensorLost(f"RealSense: colour format {kind} is not supported; supported formats: {', '.join(COLOURS)}")
     return np.ascontiguousarray(np.asanyarray(frame.get_data())[..., COLOURS[kind]])
 
 

@@ -37,11 +37,11 @@ RECORD, CHUNK = struct.Struct("<BQ"), b"\x06"  # a record's header, with kind an
 CHUNK_HEAD = struct.Struct("<BQQQQII")  # record header, times, size, checksum, length of the compression's name
 EXPANDED_MOST = 8  # assumed compression ratio of a truncated chunk
 WINDOW_BYTES = 1 << 27  # maximum zstandard window size
-NEEDED = "replay requires it and the topic `/eyes` (docs/sensors.md); other recordings need a driver of your own"
+NEEDED = "replay requires it and the topic `/eyes`; to play other recordings, write your own driver (docs/sensors.md)"
 KINDS = {  # hints for other file types, keyed by their first bytes
-    b"#ROSBAG ": " (a ROS 1 bag; convert it with `mcap convert`)",
-    b"SQLite f": " (a ROS 2 bag in SQLite; convert it with `ros2 bag convert`)",
-    b"version ": " (a Git LFS pointer; fetch the file with `git lfs pull`)",
+    b"#ROSBAG ": " but a ROS 1 bag; convert it with `mcap convert`",
+    b"SQLite f": " but a ROS 2 bag in SQLite; convert it with `ros2 bag convert`",
+    b"version ": " but a Git LFS pointer; fetch the file itself with `git lfs pull`",
 }
 
 SYNCED_WITHIN_S = 30.0  # maximum wait for a slow disk when a recording is finished
@@ -160,7 +160,7 @@ def recording_to(path: Path, header: RecordingHeader, *, max_s: float = MAX_S) -
         if file is not None:
             file.close()
         is_taken = isinstance(error, BlockingIOError)
-        problem = "is being recorded by another process" if is_taken else f"cannot be written ({error.strerror})"
+        problem = "is being recorded by another process" if is_taken else f"cannot be written: {error.strerror}"
         raise InputError(path, "", problem) from None
     try:
         with file:
@@ -175,7 +175,7 @@ def recording_to(path: Path, header: RecordingHeader, *, max_s: float = MAX_S) -
                     part.unlink(missing_ok=True)
     except OSError as error:
         if error.filename is None and error.errno is not None:  # a failed write, such as on a full disk
-            raise InputError(path, "", f"cannot be written ({error.strerror})") from None
+            raise InputError(path, "", f"cannot be written: {error.strerror}") from None
         raise
 
 
@@ -199,7 +199,7 @@ class Recording:
         self.header = self._read_header()
         first = next(self.samples(), None)
         if first is None:
-            cut_off = "" if self.is_whole else "  (the file ends within the first sample)"
+            cut_off = "" if self.is_whole else " because the file ends within the first sample"
             raise InputError(path, "", f"contains no complete sample{cut_off}")
         self.first = first
 
@@ -224,7 +224,7 @@ class Recording:
         if not foreign and not self.is_whole:
             raise InputError(self.path, "", "is an MCAP recording that ends before its first sample")
         by = ", ".join(filter(None, (*self._written_by, foreign)))
-        raise InputError(self.path, fmt.METADATA_NAME, f"is missing from this MCAP recording ({by}): {NEEDED}")
+        raise InputError(self.path, fmt.METADATA_NAME, f"is missing from this MCAP recording ({by}); {NEEDED}")
 
     def _records(self) -> Iterator[tuple[str, Any]]:
         """Yield messages with their topics, and metadata with an empty topic, up to the first damaged record."""
@@ -251,11 +251,11 @@ class Recording:
         except (InputError, ImportError):
             raise
         except OSError as error:
-            raise InputError(self.path, "", f"cannot be read ({error.strerror})") from None
+            raise InputError(self.path, "", f"cannot be read: {error.strerror}") from None
         except Exception as error:  # errors raised by mcap, lz4 and zstandard for a damaged file
             if self.is_whole:
                 problem = str(error) or type(error).__name__
-                log.warning("%s: the file is truncated or damaged; reading the intact part (%s)", self.path, problem)
+                log.warning("%s: the file is truncated or damaged; reading the intact part: %s", self.path, problem)
             self.is_whole = False
 
     def samples(self) -> Iterator[SensorFrame]:
@@ -378,7 +378,7 @@ def _unpacked(chunk: Any, *, source: Path, max_bytes: int) -> bytes:
     data = _expanded(chunk.compression, chunk.data, room=room)
     if len(data) > max_bytes:
         size = f"a chunk of {len(chunk.data)} bytes unpacks to {max(declared, len(data)) / MIB:.1f} MiB"
-        raise InputError(source, "", f"{size}; the maximum is {max_bytes / MIB:g} MiB")
+        raise InputError(source, "", f"{size}, but the maximum is {max_bytes / MIB:g} MiB")
     if len(data) != declared:
         raise ValueError(f"a chunk does not unpack to the {declared} bytes that it declares")
     return data

@@ -47,17 +47,17 @@ class EyeSample(Message):
 
     model_config = ConfigDict(title="phasestack.EyeSample")
 
-    sequence: Count = Field(description="the device's frame number; gaps mean lost frames")
+    sequence: Count = Field(description="frame number of the device; gaps mean lost frames")
     capture_ns: Count = Field(description="time of exposure, on the monotonic clock")
     eyes_m: tuple[Point, Point] | None = Field(
-        description="in the `sensor` frame (+x right, +y down, +z away from the sensor); null: no face"
+        description="eyes in the `sensor` frame (+x right, +y down, +z away from the sensor); null if there is no face"
     )
     confidence: tuple[Unit, Unit] = Field((1.0, 1.0), description="confidence in the left and right eye, 0 to 1")
     covariance_m2: tuple[Row, Row, Row] | None = Field(
         None, description="3x3 covariance of the midpoint of the eyes, if known"
     )
-    completed: Literal["", "left", "right"] = Field("", description="the eye that was hidden and has been filled in")
-    true_eyes_m: tuple[Point, Point] | None = Field(None, description="frame `stack`; only if the truth is known")
+    completed: Literal["", "left", "right"] = Field("", description="eye that was hidden and has been filled in")
+    true_eyes_m: tuple[Point, Point] | None = Field(None, description="true eyes in the `stack` frame, if known")
 
 
 class Stamp(Message):
@@ -142,7 +142,9 @@ class RecordingHeader:
         """
         version = metadata.get("schema_version", "missing")
         if version != str(SCHEMA_VERSION):
-            raise ValueError(f"schema version {version} is not supported; this program reads version {SCHEMA_VERSION}")
+            raise ValueError(
+                f"schema version {version} is not supported; this phasestack reads version {SCHEMA_VERSION}"
+            )
         flags = {f.name: metadata.get(f.name) == "1" for f in fields(cls) if f.type == "bool"}
         return cls(metadata.get("driver", ""), metadata.get("serial", ""), **flags)
 
@@ -220,7 +222,7 @@ def colour_from_message(data: bytes, *, max_pixels: int = 1 << 26) -> U8:
     coded = base64.b64decode(_read(ColourImage, data).data)
     width, height = picture_size(coded)
     if max(width, height) > IMAGE_SIDE_MAX_PX or width * height > max_pixels:
-        raise ValueError(f"a colour image of {width} by {height} pixels exceeds the maximum of {max_pixels:,} pixels")
+        raise ValueError(f"a colour image of {width} x {height} pixels exceeds the maximum of {max_pixels:,} pixels")
     image = None if is_cut_off(coded) else cv2.imdecode(np.frombuffer(coded, np.uint8), cv2.IMREAD_COLOR)
     if image is None:
         raise ValueError("a colour image cannot be decoded")
@@ -242,7 +244,9 @@ def depth_from_message(data: bytes) -> U16:
     image = _read(DepthImage, data)
     raw = base64.b64decode(image.data)
     if len(raw) != 2 * image.width * image.height:
-        raise ValueError(f"a depth image has {len(raw)} bytes, but {image.width} by {image.height} pixels of 16 bits")
+        raise ValueError(
+            f"a depth image has {len(raw)} bytes, but {image.width} x {image.height} pixels need two bytes each"
+        )
     return np.frombuffer(raw, "<u2").reshape(image.height, image.width).astype(np.uint16)
 
 

@@ -35,8 +35,8 @@ def open_sensor(settings: SensorSettings, clock: Clock, *, latency_ms: float = 0
     if is_plugin(name):
         return _plugin(name, settings, clock)
     if name not in DRIVERS:
-        known = f"{', '.join(DRIVERS)}, or your own class: module:Class"
-        raise InputError("sensor", "driver", f"unknown driver {name!r}{nearest(name, DRIVERS)}; must be one of {known}")
+        known = f"{', '.join(DRIVERS)} or your own class as module:Class"
+        raise InputError("sensor", "driver", f"unknown driver {name!r}{nearest(name, DRIVERS)} (drivers: {known})")
     driver = plugin_class(f"runtime.sensor.{DRIVERS[name]}", Sensor, field="sensor.driver")
     replayed = {"loop": settings.loop, "latency_ms": latency_ms}
     sensor: Sensor = driver(settings.source, clock, **replayed) if name == "replay" else driver(settings, clock)

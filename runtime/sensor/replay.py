@@ -60,13 +60,17 @@ class ReplayDriver(SteppedSensor):
             if frame.capture_ns <= last_ns:
                 if not is_logged:
                     log.warning(
-                        "%s: skipping samples that are not later than their predecessor: %d", self.path, frame.sequence
+                        "%s: skipping sample %d and all others that are not later than the sample before",
+                        self.path,
+                        frame.sequence,
                     )
                 is_logged = True
                 continue
             seconds = (frame.capture_ns - recording.first.capture_ns) / NS_PER_S
             if seconds > LIMITS.recording_s:
-                problem = f"sample {number} is {seconds:.6g} s after the first; the maximum is {LIMITS.recording_s:g} s"
+                problem = (
+                    f"sample {number} is {seconds:.6g} s after the first, but the maximum is {LIMITS.recording_s:g} s"
+                )
                 raise InputError(self.path, "capture_ns", problem)
             last_ns = frame.capture_ns
             yield frame

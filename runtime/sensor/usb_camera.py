@@ -49,7 +49,7 @@ class UsbCameraDriver(Sensor):
                 their field of view.
         """
         if not settings.fov_deg:
-            raise InputError("sensor", "fov_deg", "is required: the camera's horizontal field of view in degrees")
+            raise InputError("sensor", "fov_deg", "must be set to the camera's horizontal field of view in degrees")
         source = settings.source if settings.source != "demo" else ""
         protocol = re.match(r"([\w+.-]+):", source)
         if protocol is not None and protocol[1] not in STREAMS:
@@ -66,12 +66,12 @@ class UsbCameraDriver(Sensor):
     def open(self) -> None:
         self.close()
         if self._is_device and not Path(self._source).exists():
-            raise SensorLost(f"{self._source}: no such camera")
+            raise SensorLost(f"{self._source}: camera not found; connect it or correct sensor.source")
         capture = self._opened()
         if not capture.isOpened():
             capture.release()
             raise SensorLost(
-                f"{self._source} cannot be opened; it may be in use, or this user may not be in the group video"
+                f"{self._source} cannot be opened; close programs that use it, or add this user to the group video"
             )
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
         self._capture = capture
@@ -83,11 +83,11 @@ class UsbCameraDriver(Sensor):
 
     def read_newest(self, timeout_s: float) -> SensorFrame:
         if self._capture is None:
-            raise SensorLost("not open")
+            raise SensorLost(f"{self._source} is not open")
         for _ in range(QUEUE_MAX):
             begin_ns = self._clock.now_ns()
             if not self._capture.grab():  # waits for the next picture; the worker handles a hang
-                raise SensorLost(f"{self._source} has stopped delivering pictures")
+                raise SensorLost(f"{self._source} stopped delivering pictures")
             self._number += 1
             now_ns = self._clock.now_ns()
             if not self._is_device or now_ns - begin_ns > WAITED_NS:

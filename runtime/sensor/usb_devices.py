@@ -61,7 +61,9 @@ class UsbDevice:
         """Return the problems that prevent this device from being used, each with a remedy."""
         problems = []
         if self.known.needs_usb3 and 0 < self.speed < SUPER_SPEED:
-            problems.append(f"connected at {SPEEDS[self.speed]}, needs USB 3; use a blue port and the original cable")
+            problems.append(
+                f"connected at {SPEEDS[self.speed]}, but requires USB 3; use a blue port and the original cable"
+            )
         if not self.is_accessible:
             problems.append(f"permission denied; install the udev rule {UDEV_RULE} and reconnect the device")
         return problems
@@ -99,8 +101,8 @@ def find_devices(backend: Any = None) -> list[UsbDevice]:
         devices: Iterable[Any] = usb.core.find(find_all=True, backend=backend)
         pairs = [(device, _BY_ID.get((device.idVendor, device.idProduct))) for device in devices]
     except usb.core.NoBackendError:
-        raise MissingPart("libusb is not installed (Debian: apt install libusb-1.0-0)") from None
+        raise MissingPart("libusb is not installed; run: sudo apt install libusb-1.0-0") from None
     except usb.core.USBError as error:
-        raise SensorLost(f"USB devices cannot be listed: {error}") from None
+        raise SensorLost(f"cannot list USB devices: {error}") from None
     connected = [_described(device, known) for device, known in pairs if known is not None]
     return sorted(connected, key=lambda d: (d.bus, d.address))

@@ -174,7 +174,7 @@ class SensorWorker(Samples):
         if attempt is None or self._clock.now_ns() <= attempt.deadline_ns or not attempt.thread.is_alive():
             return
         self._hung = [a for a in self._hung if a.thread.is_alive()]
-        reason = f"the sensor's driver hangs ({len(self._hung) + 1} threads abandoned)"
+        reason = f"the sensor's driver is not responding ({len(self._hung) + 1} threads abandoned)"
         if not attempt.abandoned.is_set():
             log.warning("sensor: %s", reason)
             self._set(attempt, SensorState.HUNG, reason)
@@ -248,7 +248,7 @@ class SensorWorker(Samples):
         try:
             driver.close()
         except BaseException:
-            log.exception("sensor: closing")
+            log.exception("sensor: error while closing")
         self._account(driver)
 
     def _receive(self, attempt: _Attempt, driver: Sensor) -> None:
@@ -276,7 +276,9 @@ class SensorWorker(Samples):
                 timeouts += 1
                 self._set(attempt, SensorState.STALLED, str(error))
                 if timeouts >= TIMEOUTS_TO_REOPEN:
-                    raise SensorLost(f"the sensor has delivered no samples for {timeouts * s.timeout_s:g} s") from error
+                    raise SensorLost(
+                        f"the sensor has not delivered any samples for {timeouts * s.timeout_s:g} s"
+                    ) from error
                 continue
             timeouts, now_ns = 0, self._clock.now_ns()
             if not (frames := self._timely(frames, now_ns)):
@@ -307,7 +309,9 @@ class SensorWorker(Samples):
         timely = [frame for frame in frames if -AHEAD_NS <= now_ns - frame.capture_ns <= BEHIND_NS]
         if len(timely) < len(frames):
             ahead_s = (frames[-1].capture_ns - now_ns) / NS_PER_S
-            self._untimely = f"capture times are off by {ahead_s:+.3f} s, so they are not on the run's clock"
+            self._untimely = (
+                f"the capture times are off by {ahead_s:+.3f} s; the driver must report times on the run's clock"
+            )
             if not self._was_well:
                 raise FatalError(self._untimely)
             with self._lock:

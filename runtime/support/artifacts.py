@@ -59,7 +59,7 @@ def write_bytes(path: Path, data: bytes, *, like: Path | None = None) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
     except OSError as error:
-        raise InputError(path, "", f"cannot be written ({error.strerror})") from None
+        raise InputError(path, "", f"cannot be written: {error.strerror}") from None
     try:
         with os.fdopen(handle, "wb") as file:
             file.write(data)
@@ -74,7 +74,7 @@ def write_bytes(path: Path, data: bytes, *, like: Path | None = None) -> None:
     except BaseException as error:
         Path(name).unlink(missing_ok=True)
         if isinstance(error, OSError):  # for example because the disk is full
-            raise InputError(path, "", f"cannot be written ({error.strerror})") from None
+            raise InputError(path, "", f"cannot be written: {error.strerror}") from None
         raise
 
 
@@ -153,7 +153,7 @@ class OutputFolder:
             self._held = os.open(self.staging, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
             fcntl.flock(self._held, fcntl.LOCK_EX)  # released by `discard`, or by the system when this process ends
         except OSError as error:
-            raise InputError(self.target, "", f"cannot be written ({error.strerror})") from None
+            raise InputError(self.target, "", f"cannot be written: {error.strerror}") from None
         return self
 
     def __exit__(
@@ -174,7 +174,7 @@ class OutputFolder:
             file = self.target / Path(error.source).relative_to(self.staging)
             raise InputError(file, error.field, error.problem) from None
         if isinstance(error, OSError) and str(error.filename or "").startswith(str(self.staging)):
-            raise InputError(self.target, "", f"cannot be written ({error.strerror})") from None
+            raise InputError(self.target, "", f"cannot be written: {error.strerror}") from None
 
     def _put_in_place(self) -> None:
         """Move all staged files to the target folder.
@@ -195,7 +195,7 @@ class OutputFolder:
             for folder in {place.parent for place in places.values()}:
                 sync(folder)
         except OSError as error:
-            raise InputError(self.target, "", f"cannot be written ({error.strerror})") from None
+            raise InputError(self.target, "", f"cannot be written: {error.strerror}") from None
 
     def discard(self) -> None:
         """Remove the staged files and release the lock. Repeated calls have no effect."""
@@ -231,9 +231,9 @@ def _check_free(place: Path, *, within: Path) -> None:
         if folder == within:
             break
         if folder.exists() and not folder.is_dir():
-            raise InputError(folder, "", "exists but is not a folder, so the output cannot be written")
+            raise InputError(folder, "", "is not a folder, so the output cannot be written there")
     if place.is_dir():
-        raise InputError(place, "", "is a folder, so the output of that name cannot be written")
+        raise InputError(place, "", "is a folder, so the output file of that name cannot be written")
 
 
 @contextmanager

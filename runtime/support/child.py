@@ -77,7 +77,7 @@ def in_child(
         )
     except OSError as error:
         os.close(memory)
-        raise TransientError(f"{source}: no process can be started to read it ({error.strerror})") from error
+        raise TransientError(f"{source}: cannot start a process to read the file: {error.strerror}") from error
     finally:
         theirs.close()
     with child, ours:
@@ -86,8 +86,10 @@ def in_child(
                 ours.send((work, args, str(source), asdict(LIMITS), (memory_bytes, seconds)))
             result = _outcome(ours, str(source), seconds)
             if result is None:
-                limit = f"needs more than {memory_bytes // MIB} MiB to read"
-                raise InputError(source, "", f"{limit} or crashes the process that reads it ({child.wait()})")
+                limit = f"needs more than {memory_bytes // MIB} MiB of memory"
+                raise InputError(
+                    source, "", f"{limit} or crashed the process that read the file (exit status {child.wait()})"
+                )
             return pickle.loads(result[0], buffers=_mapped(memory, result[1]))  # type: ignore[no-any-return]
         finally:
             child.kill()
@@ -116,7 +118,7 @@ def _outcome(channel: Connection, source: str, seconds: float) -> tuple[bytes, l
                 step = content[0]
         progress.tell(*step)  # the listener may raise
         if time.monotonic() > end_s:
-            raise InputError(source, "", f"is not ready after {seconds:g} s")
+            raise InputError(source, "", f"was not loaded within {seconds:g} s")
 
 
 def _mapped(memory: int, sizes: list[int]) -> list[memoryview | bytearray]:
@@ -193,7 +195,7 @@ def main(channel: Connection, memory: int) -> None:
         if missing := missing_extra(error):
             channel.send(("refused", missing, None))
             return
-        problem = one_line(f"cannot be read ({type(error).__name__}: {error})")
+        problem = one_line(f"cannot be read: {type(error).__name__}: {error}")
         channel.send(("refused", InputError(source, "", problem), None))
 
 

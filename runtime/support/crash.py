@@ -48,8 +48,8 @@ def written(error: BaseException) -> str:
             with contextlib.suppress(OSError):  # some files may belong to another user
                 for old in sorted(folder.glob(f"{STEM}*.log"))[:-KEPT]:
                     old.unlink()
-            return f"unexpected error ({summary}); details are in {path}"
-    return f"unexpected error ({summary}); no report could be written"
+            return f"unexpected error: {summary}; please report this bug with the file {path}"
+    return f"unexpected error: {summary}; the crash report could not be written"
 
 
 def watch_threads() -> None:

@@ -38,8 +38,8 @@ def offscreen_context() -> moderngl.Context:
         return moderngl.create_context(require=MINIMUM_VERSION, standalone=True, **EGL)
     except Exception as error:  # moderngl and glcontext raise plain Exception
         raise MissingPart(
-            f"no OpenGL without a screen ({str(error).strip() or 'EGL failed'}); "
-            f"install Debian's packages {DEBIAN_PACKAGES}"
+            f"cannot create an OpenGL context without a screen: {str(error).strip() or 'EGL failed'}; "
+            f"install the Debian packages {DEBIAN_PACKAGES}"
         ) from None
 
 

@@ -86,7 +86,7 @@ class RateLimit(logging.Filter):
             return False
         self._seen[key] = (start_ns, passed + 1, 0)
         if suppressed:
-            record.msg, record.args = f"{record.getMessage()} ({suppressed} more like this were not shown)", ()
+            record.msg, record.args = f"{record.getMessage()} ({suppressed} similar messages suppressed)", ()
         return True
 
 

@@ -76,7 +76,7 @@ def read_animation(path: Path, *, background: Colour = WHITE) -> tuple[list[U8],
         numbers = range(1 if image.info.get("default_image") else 0, image.n_frames)
     if len(numbers) * header.width_px * header.height_px > LIMITS.pixels:
         size = f"{header.width_px} x {header.height_px}"
-        total = f"{len(numbers)} frames of {size} pixels, more than {LIMITS.pixels:,} pixels in all"
+        total = f"{len(numbers)} frames of {size} pixels, which exceeds the limit of {LIMITS.pixels:,} pixels in total"
         log.warning("%s has %s; showing only its first frame", path, total)
         numbers = numbers[:1]
     frames = list(_decoded(path, data, tuple(numbers), background))
@@ -124,7 +124,7 @@ def rgb_of(image: Any, source: object, *, background: Colour = WHITE) -> U8:
     image = _upright(image)
     if image.mode == "F" or (image.mode == "I" and image.format not in (None, "PPM")):
         raise InputError(
-            str(source), "", "its 32-bit values have no defined range; save it with 8 or 16 bits per channel"
+            str(source), "", "has 32-bit values without a defined range; save the picture with 8 or 16 bits per channel"
         )
     colours = "CMYK" if image.mode == "CMYK" else "L" if image.mode in ("1", "L", "LA", *DEEP) else "RGB"
     to_srgb = _to_srgb(profile, colours, source) if profile else None
@@ -190,7 +190,7 @@ def _to_srgb(profile: bytes, colours: str, source: object) -> Any:
             flags=ImageCms.Flags.BLACKPOINTCOMPENSATION,
         )
     except Exception as error:  # like browsers, ignore a broken profile or one for another colour space
-        log.info("%s: its colour profile is ignored (%s)", source, error)
+        log.info("%s: ignoring the colour profile: %s", source, error)
         return None
     if colours == "CMYK":
         return transform.apply

@@ -34,19 +34,19 @@ JPS_LAYOUTS = {2: "side-by-side", 3: "top-bottom", 4: "anaglyph"}
 JPS_HALF_HEIGHT, JPS_HALF_WIDTH, JPS_LEFT_FIRST = 1, 2, 4
 GAIN_MAP = (b"hdrgm", b"21496-1")  # markers of a gain map, a second picture that holds only brightness
 HEAD_BYTES = 512  # number of bytes at the beginning of a file used to identify its kind
-UNDECODED = "is not an image that can be decoded"
+UNDECODED = "cannot be decoded as an image"
 ANOTHER = "save it as PNG, JPEG or AVIF"
-CAMERA_SET = "such a scene is trained first; its splats (.ply) are drawn, and its folder of pictures as a slideshow"
+CAMERA_SET = "train the scene first and open its splats (.ply), or open its folder of pictures as a slideshow"
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")  # mostly TIFF files
 RAW_KIND = "a camera's raw picture", "develop it and save it as JPEG"
 OTHER_KINDS = (  # unsupported formats, each with the offset and value of its marker, its name and a remedy
-    (0, b"\xff\x0a", "JPEG XL", f"{ANOTHER} (djxl in.jxl out.png)"),
-    (4, b"JXL \r\n", "JPEG XL", f"{ANOTHER} (djxl in.jxl out.png)"),
-    (0, b"v/1\x01", "OpenEXR", "its values have no fixed range: tone-map it and save it as PNG"),
-    (0, b"#?RADIANCE", "Radiance HDR", "its values have no fixed range: tone-map it and save it as PNG"),
+    (0, b"\xff\x0a", "JPEG XL", f"{ANOTHER}, for example with `djxl in.jxl out.png`"),
+    (4, b"JXL \r\n", "JPEG XL", f"{ANOTHER}, for example with `djxl in.jxl out.png`"),
+    (0, b"v/1\x01", "OpenEXR", "tone-map the picture and save it as PNG"),
+    (0, b"#?RADIANCE", "Radiance HDR", "tone-map the picture and save it as PNG"),
     (4, b"jP  \r\n", "JPEG 2000", ANOTHER),
     (0, b"8BPS", "a Photoshop document", ANOTHER),
-    (0, b"%PDF", "PDF", "make pictures of its pages (pdftoppm -png)"),
+    (0, b"%PDF", "PDF", "convert its pages to pictures with `pdftoppm -png`"),
     (0, b"%!PS", "PostScript", ANOTHER),
     (0, b"DDS ", "a texture (DDS)", ANOTHER),
     (1, b"KTX ", "a texture (KTX)", ANOTHER),
@@ -55,8 +55,8 @@ OTHER_KINDS = (  # unsupported formats, each with the offset and value of its ma
     (0, b"PK\3\4", "a ZIP archive", "unpack it first"),
     (0, b"7z\xbc\xaf", "a 7z archive", "unpack it first"),
     (0, b"Rar!", "a RAR archive", "unpack it first"),
-    (0, b"\x89MCAP", "a recording", "it is replayed with --replay"),
-    (0, b"version https://git-lfs", "a Git LFS pointer", "fetch the file itself (git lfs pull)"),
+    (0, b"\x89MCAP", "a recording", "play it with --replay"),
+    (0, b"version https://git-lfs", "a Git LFS pointer", "fetch the file itself with `git lfs pull`"),
     (0, b"<svg", "SVG", ANOTHER),
     (0, b"<!DOCTYPE html", "a web page", "download the picture itself"),
     (0, b"<!doctype html", "a web page", "download the picture itself"),
@@ -124,7 +124,7 @@ def _header_of(path: Path, coded: bytes | IO[bytes]) -> Header:
             pixels.
     """
     if path.suffix.lower() in RAW:  # many raw files are TIFFs, and Pillow would show only their thumbnails
-        raise InputError(path, "", "is {}, which is not supported: {}".format(*RAW_KIND))
+        raise InputError(path, "", "is {}, which is not supported; {}".format(*RAW_KIND))
     try:
         with opened(coded) as image:
             width, height = image.size
@@ -177,7 +177,7 @@ def _views(image: Any, *, is_named_so: bool) -> tuple[tuple[int, ...], str]:
     try:
         image.seek(1)
     except Exception:  # the class of the exception depends on Pillow's decoder
-        return (0,), "its second picture is missing: both eyes see the first one"
+        return (0,), "the second picture is missing, so both eyes see the first picture"
     extra = b"".join(content for _, content in image.applist)
     if image.size != size or image.layers != 3 or any(mark in extra for mark in GAIN_MAP):
         return (0,), ""
@@ -269,18 +269,22 @@ def undecodable(data: bytes, error: Exception | None = None) -> str:
         return "is empty"
     brand = data[8:12] if data[4:8] == b"ftyp" else b""
     if brand in (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1") and "HEIF" not in _formats():
-        return f"is HEIC, which the extra `heic` reads (pip install pillow-heif); or {ANOTHER}"
+        return f"is HEIC, which requires the extra `heic` (pip install pillow-heif); otherwise {ANOTHER}"
     for place, mark, name, way_out in OTHER_KINDS:
         if data[place : place + len(mark)] == mark and (mark != b"CR" or data[:2] in (b"II", b"MM")):
-            return f"is {name}, which is not supported: {way_out}"
+            return f"is {name}, which is not supported; {way_out}"
     if data[:5] == b"<?xml" and b"<svg" in data[:HEAD_BYTES]:
-        return f"is SVG, which is not supported: {ANOTHER}"
+        return f"is SVG, which is not supported; {ANOTHER}"
     if data.lstrip()[:1] == b"{" and b'"frames"' in data:
-        return f"is a camera set, as used for a NeRF: {CAMERA_SET}"
+        return f"is a set of cameras for training a NeRF; {CAMERA_SET}"
     told = str(error).lower()
     if is_cut_off(data) or _promises_more(data) or "truncated" in told or "end of file" in told:
-        return f"{UNDECODED} (it is cut off)"
-    return UNDECODED if error is None or isinstance(error, UnidentifiedImageError) else f"{UNDECODED} (it is damaged)"
+        return f"{UNDECODED} because the file is truncated"
+    return (
+        UNDECODED
+        if error is None or isinstance(error, UnidentifiedImageError)
+        else f"{UNDECODED} because the file is damaged"
+    )
 
 
 def _promises_more(data: bytes) -> bool:
@@ -351,7 +355,7 @@ def check_size(
     is_deep = head.startswith(PNG) and head[PNG_DEPTH] == b"\x10"
     most = LIMITS.pixels // (2 if is_deep else 1)
     if max(width_px, height_px) > SIDE_MAX_PX or width_px * height_px > most:
-        problem = f"has {width_px} x {height_px} pixels{' of 16 bits a channel' * is_deep}; at most {most:,}"
+        problem = f"has {width_px} x {height_px} pixels{' of 16 bits per channel' * is_deep}; the maximum is {most:,}"
         raise InputError(source, field, f"{name} {problem}".strip())
 
 
@@ -385,7 +389,7 @@ def camera_set_in(folder: Path) -> str:
     A camera set is a collection of photos with camera poses, as used to train a NeRF.
     """
     sets = sorted(folder.glob("transforms*.json"))
-    return f"holds a camera set, as used for a NeRF ({sets[0].name}): {CAMERA_SET}" if sets else ""
+    return f"contains a set of cameras for training a NeRF ({sets[0].name}); {CAMERA_SET}" if sets else ""
 
 
 def read_coded(path: Path) -> tuple[bytes, Header]:

@@ -25,7 +25,7 @@ def within(low: float, high: float, unit: str, *, zero: bool = False) -> AfterVa
     Examples:
         >>> within(0.005, 20.0, "m").func(518.4)
         Traceback (most recent call last):
-        ValueError: 518.4 m is beyond 20 m: did you mean millimetres (0.5184)?
+        ValueError: 518.4 m is out of range; for 518.4 millimetres, write 0.5184
     """
 
     def check(value: float) -> float:
@@ -40,14 +40,14 @@ def within(low: float, high: float, unit: str, *, zero: bool = False) -> AfterVa
 def check_text(value: str) -> str:
     """Return the text unchanged if it can be a name or a path. Raises ValueError otherwise."""
     if "\0" in value:
-        raise ValueError("contains a NUL character")
+        raise ValueError("must not contain a NUL character")
     try:
         size = len(value.encode())
         longest = max(len(part.encode()) for part in value.split("/"))
     except UnicodeEncodeError:
-        raise ValueError("is not UTF-8") from None
+        raise ValueError("is not valid UTF-8") from None
     if size > TEXT_MAX_BYTES or longest > PART_MAX_BYTES:
-        raise ValueError(f"is too long ({len(value)} characters, starting with {value[:20]!r})")
+        raise ValueError(f"is too long: it has {len(value)} characters and starts with {value[:20]!r}")
     return value
 
 

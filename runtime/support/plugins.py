@@ -51,7 +51,9 @@ def plugin_class(name: str, base: type, *, field: str) -> Any:
         if missing := missing_extra(error):
             raise missing from None
         problem = one_line(f"{type(error).__name__}: {error}")
-        raise InputError(field, "", f"`{module}` cannot be imported from Python's path ({problem})") from error
+        raise InputError(
+            field, "", f"`{module}` cannot be imported: {problem}; check that it is on PYTHONPATH"
+        ) from error
     if not (isinstance(plugin, type) and issubclass(plugin, base)):
         package = "torch.nn" if base.__module__.startswith("torch.") else "phasestack"
         raise InputError(field, "", f"`{name}` is not a class derived from {package}.{base.__name__}")

@@ -29,15 +29,15 @@ def refusal(value: float, low: float, high: float, unit: str = "") -> str:
 
     Examples:
         >>> refusal(518.4, 0.005, 20.0, "m")
-        '518.4 m is beyond 20 m: did you mean millimetres (0.5184)?'
+        '518.4 m is out of range; for 518.4 millimetres, write 0.5184'
     """
     if low <= value <= high:
         return ""
     named = f" {unit}" if unit else ""
     if math.isnan(value):
-        return f"is not a number; the range is {low:g} to {high:g}{named}"
-    bound, side = (high, "beyond") if value > high else (low, "below")
+        return f"is not a number; use {low:g} to {high:g}{named}"
+    bound = high if value > high else low
     for factor, other in OTHER_UNITS.get(unit, ()):
         if abs(value) > abs(bound) and low <= value * factor <= high:
-            return f"{value:g}{named} is {side} {bound:g}{named}: did you mean {other} ({value * factor:g})?"
-    return f"{value:g}{named} is {side} {bound:g}{named}; the range is {low:g} to {high:g}{named}"
+            return f"{value:g}{named} is out of range; for {value:g} {other}, write {value * factor:g}"
+    return f"{value:g}{named} is out of range; use {low:g} to {high:g}{named}"

@@ -45,20 +45,20 @@ def read_table(path: Path) -> dict[str, Any]:
     text = untrusted_input.read_text(path, most_bytes=TABLE_BYTES_MAX)
     table = untrusted_input.parsed_json(text, source=path) if path.suffix.lower() == ".json" else _toml(text, path)
     if not isinstance(table, dict):
-        raise InputError(path, "", "must contain one table")
+        raise InputError(path, "", "must contain a table at the top level")
     return table
 
 
 def _toml(text: str, path: Path) -> Any:
     keys = KEY_SEPARATORS.split(STRINGS_AND_COMMENTS.sub("_", text))
     if max(key.count(".") for key in keys) >= KEY_PARTS_MAX:
-        raise InputError(path, "", f"malformed: a key of more than {KEY_PARTS_MAX} parts")
+        raise InputError(path, "", f"malformed: a key has more than {KEY_PARTS_MAX} parts")
     try:
         return tomllib.loads(text)
     except ValueError as error:
         raise InputError(path, "", f"malformed: {error}") from None
     except RecursionError:
-        raise InputError(path, "", "malformed: nested too deep") from None
+        raise InputError(path, "", "malformed: nested too deeply") from None
 
 
 def validated(model: type[M], table: dict[str, Any], *, source: str | Path, folder: Path | None = None) -> M:

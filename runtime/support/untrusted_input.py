@@ -60,7 +60,7 @@ def checked_path(path: str | Path, *, source: str | Path = "", field: str = "") 
         raise InputError(source or str(path), field, "the path contains a NUL character or is not UTF-8") from None
     except OSError as error:
         if error.errno == errno.ENAMETOOLONG:
-            raise InputError(source or str(path), field, f"is not a valid path ({error.strerror})") from None
+            raise InputError(source or str(path), field, f"is not a valid path: {error.strerror}") from None
     return Path(path)
 
 
@@ -78,7 +78,7 @@ def is_there(path: str | Path, *, folder: bool = False) -> bool:
     try:
         return checked.is_dir() if folder else checked.exists()
     except OSError as error:
-        raise InputError(path, "", f"cannot be read ({error.strerror})") from None
+        raise InputError(path, "", f"cannot be read: {error.strerror}") from None
 
 
 def open_regular(
@@ -103,7 +103,7 @@ def open_regular(
     try:
         number = os.open(checked, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY)
     except OSError as error:
-        raise InputError(name, field, f"cannot be read ({error.strerror})") from None
+        raise InputError(name, field, f"cannot be read: {error.strerror}") from None
     try:
         status = os.fstat(number)
         if not stat.S_ISREG(status.st_mode):
@@ -129,9 +129,9 @@ def read_bytes(path: str | Path, *, most_bytes: int, source: str | Path = "", fi
             if len(data) > size:  # the file has grown since it was opened
                 data += file.read(most_bytes + 1 - len(data))
         except OSError as error:
-            raise InputError(name, field, f"cannot be read ({error.strerror})") from None
+            raise InputError(name, field, f"cannot be read: {error.strerror}") from None
     if len(data) > most_bytes:
-        raise InputError(name, field, f"is larger than {_size(most_bytes)}")
+        raise InputError(name, field, f"is larger than the maximum of {_size(most_bytes)}")
     return data
 
 
@@ -149,7 +149,7 @@ def decoded(data: bytes, *, source: str | Path, field: str = "") -> str:
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(source, field, f"is not UTF-8 at byte {error.start}") from None
+        raise InputError(source, field, f"is not valid UTF-8 at byte {error.start}") from None
 
 
 def read_json(path: str | Path, *, most_bytes: int = JSON_BYTES_MAX) -> Any:
@@ -181,7 +181,7 @@ def parsed_json(text: str | bytes, *, source: str | Path, most_depth: int = JSON
         raise InputError(source, "", f"malformed JSON: {error}") from None
     except RecursionError:
         pass
-    raise InputError(source, "", f"JSON is nested deeper than {most_depth}")
+    raise InputError(source, "", f"the JSON is nested more than {most_depth} levels deep")
 
 
 def _depth(value: Any) -> int:
@@ -206,9 +206,9 @@ def whole_from_text(text: str, *, source: str | Path, field: str) -> int:
     """Parse a non-negative integer. Raises InputError for other text and for more than DIGITS_MAX digits."""
     # `isdigit` alone accepts a superscript two, and `int` accepts digits from other scripts.
     if not (text.isascii() and text.isdigit()):
-        raise InputError(source, field, f"is not a whole number: {shown(text)}")
+        raise InputError(source, field, f"must be a non-negative whole number, not {shown(text)}")
     if len(text) > DIGITS_MAX:
-        raise InputError(source, field, f"is a number of {len(text)} digits")
+        raise InputError(source, field, f"must not have {len(text)} digits")
     return int(text)
 
 

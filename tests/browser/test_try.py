@@ -60,7 +60,7 @@ def trying(folder: Path, *more: str) -> Iterator[str]:
         try:
             yield json.loads(process.stdout.readline())["url"]
         finally:
-            if "the time is up" not in (folder / "log").read_text():
+            if "reached the time limit" not in (folder / "log").read_text():
                 process.terminate()
             assert process.wait(60) == 0, (folder / "log").read_text()[-3000:]
             process.stdout.close()
@@ -183,7 +183,7 @@ def test_a_resting_head_is_sampled_on_and_captures_only_go_forward() -> None:
 
 def test_it_ends_when_its_time_is_up(tmp_path: Path) -> None:
     with trying(tmp_path, "--seconds", "1") as address:
-        assert eventually(lambda: "the time is up" in (tmp_path / "log").read_text(), within_s=120.0), address
+        assert eventually(lambda: "reached the time limit" in (tmp_path / "log").read_text(), within_s=120.0), address
 
 
 @pytest.mark.parametrize(("option", "value"), [("--scene", "no-such-scene"), ("--model", "none.onnx")])

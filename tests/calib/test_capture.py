@@ -86,7 +86,7 @@ def capture(*options: str) -> dict:
 
 def test_a_recording_that_does_not_know_its_truth_is_refused(tmp_path: Path) -> None:
     path = recording(tmp_path / "r.mcap", [grid()[0].midpoint_m], true=False)
-    with pytest.raises(InputError, match="has no true eye positions"):
+    with pytest.raises(InputError, match="contains no true eye positions"):
         capture("--replay", str(path), "--out", str(tmp_path / "p.csv"))
     assert not (tmp_path / "p.csv").exists()
 

@@ -112,9 +112,9 @@ def test_photographs_register_the_panels_in_the_configuration(
     ("spoil", "why"),
     [
         (blurred, "blurred"),
-        (half_covered, "which is covered or cut off"),
+        (half_covered, "show the whole panel"),
         (lambda picture: picture[:, ::-1], "is mirrored"),
-        (lambda picture: np.full_like(picture, 30), "shows no mark"),
+        (lambda picture: np.full_like(picture, 30), "shows no marks"),
     ],
 )
 def test_photographs_that_cannot_be_used_are_named_and_nothing_is_written(

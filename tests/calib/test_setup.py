@@ -146,7 +146,7 @@ def test_sizes_are_typed_and_measured_distances_stay(tmp_path: Path) -> None:
     found = load_settings(config).stack
     assert (found.width_m, found.height_m) == pytest.approx((0.3442, 0.1936))
     assert found.x_m == (-0.0601, 0.0, 0.0593)
-    assert "much is not a number" in setup.say.__self__
+    assert "much is not a number; try again" in setup.say.__self__
     with pytest.raises(InputError, match="height_m"):
         geometry(scripted(tmp_path, ["", "-3"] + [""] * 4))
     geometry(scripted(tmp_path, ["", "", "58.7"] + [""] * 3))

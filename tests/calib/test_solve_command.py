@@ -87,12 +87,12 @@ def test_millimetres_on_one_side_are_refused(tmp_path: Path, scale: float, side:
     path = write_pairs(tmp_path, *mixed)
     message = refusal(path, tmp_path)
     assert "must be in metres" in message
-    assert f"{side} seems to be in millimetres" in message
+    assert f"{side} appears to be in millimetres" in message
 
 
 def test_pairs_that_do_not_fit_are_refused_with_a_hint(tmp_path: Path) -> None:
     sensor = measured()
     sensor[::5] += [0.2, 0.1, -0.2]
     message = refusal(write_pairs(tmp_path, sensor), tmp_path, "--method", "seed")
-    assert "more than 50 mm" in message
+    assert "but the limit is 50 mm" in message
     assert "robust" in message

@@ -103,7 +103,7 @@ def test_the_nearest_pair_is_shown(tmp_path: Path, context: Any, stack: PanelSta
 def test_half_a_pair_is_named(tmp_path: Path, context: Any, stack: PanelStack) -> None:
     write_pair(tmp_path, context, stack)
     next(tmp_path.glob("*_0.png")).unlink()
-    with pytest.raises(InputError, match=r"_1.png: pair0: has _1; _0 and _1"):
+    with pytest.raises(InputError, match=r"_1.png: pair0: has _1, but needs either _0 and _1"):
         read_folder(tmp_path, LEGO)
 
 
@@ -119,11 +119,11 @@ def test_newer_data_name_the_eyes_left_and_right(tmp_path: Path, context: Any, s
 
 
 def test_a_folder_without_pairs_and_a_truncated_picture_are_told(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="contains no pair0"):
+    with pytest.raises(InputError, match="contains no pictures named like pair0"):
         read_folder(tmp_path, LEGO)
     for half, y in ((0, 0.2), (1, -0.2)):
         (tmp_path / f"pair0_x6.0_y{y}_z2.0_{half}.jpg").write_bytes(b"\xff\xd8\xff broken")
-    with pytest.raises(InputError, match="not an image"):
+    with pytest.raises(InputError, match="cannot be decoded as an image"):
         EyeRealSource(read_folder(tmp_path, LEGO), fov_deg=40, background=(1, 1, 1), name="lego")
 
 
@@ -137,5 +137,5 @@ def test_a_folder_is_read_as_the_preset_in_its_name(tmp_path: Path, context: Any
     assert source.info.name == "lego_bulldozer"
     assert (source.render(view, time_ns=0) == known.render(view, time_ns=0)).all()
     named.rename(other)
-    with pytest.raises(InputError, match=r"from-the-net: name: names no preset: set content.scene"):
+    with pytest.raises(InputError, match=r"from-the-net: name: contains no preset's name; set content.scene"):
         open_content(ContentSettings(scene=str(other)), stack, context)

@@ -421,7 +421,7 @@ def test_what_is_not_drawn_is_said_once_and_in_the_info(
     path = b.write(tmp_path / "a.gltf", {}, meshes=[{"primitives": [square(b), lines]}], materials=[{}], **tables)
     source = open_content(ContentSettings(scene=str(path)), stack, context)
     assert source.info.left_out == ("KHR_materials_transmission", "animations", "points and lines")
-    assert f"{path}: is drawn without KHR_materials_transmission, animations, points and lines" in caplog.messages
+    assert f"{path}: not drawing KHR_materials_transmission, animations, points and lines" in caplog.messages
 
 
 def compressed(path: Path, *, required: bool, fallback: bool) -> Path:
@@ -460,7 +460,7 @@ def test_without_its_decoder_draco_is_named_unless_there_is_another_form(
     monkeypatch.setitem(sys.modules, "DracoPy", None)
     with pytest.raises(InputError) as refused:
         load_mesh(alone)
-    assert str(refused.value).endswith(f"Draco needs `pip install 'phasestack[draco]'`; or {WAY_OUT}")
+    assert str(refused.value).endswith(f"reading Draco requires `pip install 'phasestack[draco]'`; otherwise {WAY_OUT}")
     assert load_mesh(both).high.tolist() == [1, 1, 0]
 
 

@@ -203,7 +203,7 @@ def test_an_obj_without_its_materials_is_grey_and_a_line_says_so(
     picture = source_of(path, context, stack).render(panel_view(EYE, stack.panel(1)), time_ns=0)
     seen = picture[picture[..., 3] == 255][:, :3].astype(int)
     assert len(seen) > 1000 and np.ptp(seen, axis=1).max() < 30
-    assert f"{path}: is drawn grey without its materials (" in caplog.text
+    assert f"{path}: drawing the mesh in grey without its materials because " in caplog.text
 
 
 def with_material(folder: Path, lines: str) -> Path:
@@ -231,7 +231,10 @@ def test_a_texture_is_found_as_windows_and_exporters_write_it(tmp_path: Path, na
 def test_a_missing_texture_is_grey_and_a_line_says_so(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (part,) = load_mesh(with_material(tmp_path, "map_Kd gone.png")).parts
     assert np.ptp(part.picture[0, 0, :3].astype(int)) < 30
-    assert f"{tmp_path / 'a.obj'}: is drawn grey without its texture (gone.png does not exist)" in caplog.text
+    assert (
+        f"{tmp_path / 'a.obj'}: drawing the mesh in grey without its texture because gone.png does not exist"
+        in caplog.text
+    )
 
 
 @pytest.mark.parametrize(("line", "opacity"), [("d 0.2", 0.2), ("Tr 0.8", 0.2), ("d 1", 1.0), ("d x", 1.0), ("", 1.0)])
@@ -331,16 +334,20 @@ TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
     ("name", "data", "told"),
     [
         ("a.obj", "v\n", ""),
-        ("a.obj", "v 0 0 0\nv 1 0 nan\nv 0 1 0\nf 1 2 3\n", "vertices: 1 of 3 are not finite, or beyond 1e+15"),
-        ("a.obj", "v 0 0 0\nv 1 0 1e300\nv 0 1 0\nf 1 2 3\n", "vertices: 1 of 3 are not finite, or beyond 1e+15"),
+        ("a.obj", "v 0 0 0\nv 1 0 nan\nv 0 1 0\nf 1 2 3\n", "vertices: 1 of 3 vertices are not finite or exceed 1e+15"),
+        (
+            "a.obj",
+            "v 0 0 0\nv 1 0 1e300\nv 0 1 0\nf 1 2 3\n",
+            "vertices: 1 of 3 vertices are not finite or exceed 1e+15",
+        ),
         ("a.obj", "v 0 0 0\nv 1 0 fish\nv 0 1 0\nf 1 2 3\n", "cannot be read as a mesh"),
         ("a.obj", TRIANGLE + "f 1 2 9\n", "cannot be read as a mesh"),
-        ("a.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "faces: all have zero area"),
-        ("a.stl", "\0" * 80 + "\7\0\0\0" + "\0" * 60, "faces: the file has none"),
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "faces: all faces have zero area"),
+        ("a.stl", "\0" * 80 + "\7\0\0\0" + "\0" * 60, "faces: the file contains no faces"),
         ("a.stl", "solid x\n" + "facet normal 0 0 1\n" * 50, "faces: 50 exceeds the limit of 20"),
-        ("a.stl", "", "faces: the file has none"),
-        ("a.ply", CLOUD, "faces: the file has none"),
-        ("a.stl", "\0" * 84, "faces: the file has none"),
+        ("a.stl", "", "faces: the file contains no faces"),
+        ("a.ply", CLOUD, "faces: the file contains no faces"),
+        ("a.stl", "\0" * 84, "faces: the file contains no faces"),
         *(
             (f"a{suffix}", data, "")
             for suffix in (".glb", ".gltf", ".ply", ".obj")

@@ -88,7 +88,7 @@ def test_an_mpo_without_its_second_picture_is_shown_flat_and_says_so(
     data = mpo(tmp_path / "a.mpo", solid(RED), solid(BLUE)).read_bytes()
     (tmp_path / "a.mpo").write_bytes(data[: data.index(b"\xff\xd8\xff", 3)])
     assert len(views(tmp_path / "a.mpo")) == 1
-    assert "a.mpo: its second picture is missing" in caplog.text
+    assert "a.mpo: the second picture is missing" in caplog.text
 
 
 @pytest.mark.parametrize(("group", "colours"), [((0, 1), (RED, BLUE)), ((1, 0), (BLUE, RED)), ((0, 2), (RED,))])
@@ -204,7 +204,9 @@ def test_a_picture_called_a_quilt_without_its_numbers_gets_a_hint(tmp_path: Path
     for name in ("my-Quilt.png", "quilt_qs2x2.png"):
         write_png(tmp_path / name, solid(RED))
         open_frames(tmp_path / name, AUTO)
-    assert caplog.text.count("if it is a quilt, pass --layout qs8x6a0.75") == 1 and "my-Quilt.png" in caplog.text
+    assert (
+        caplog.text.count("if this picture is a quilt, pass --layout qs8x6a0.75") == 1 and "my-Quilt.png" in caplog.text
+    )
 
 
 # All around
@@ -263,16 +265,18 @@ def test_a_camera_set_is_called_so_as_file_and_folder(tmp_path: Path, context: A
         told = set()
         # As `run`, `solve` and `eyes` read it.
         for read in (lambda p: opened(p, context, stack), lambda p: read_pair(p, ContentSettings()), read_image):
-            with pytest.raises(InputError, match="camera set, as used for a NeRF") as error:
+            with pytest.raises(InputError, match="set of cameras for training a NeRF") as error:
                 read(path)
             told.add(str(error.value))
         assert len(told) == 1
     (tmp_path / "transforms_train.json").unlink()
     write_png(tmp_path / "train" / "0.png", solid(RED))
-    with pytest.raises(InputError, match="holds no pictures; those in train are shown by its own name"):
+    with pytest.raises(
+        InputError, match="contains no pictures; to show the pictures in train, name that folder instead"
+    ):
         opened(tmp_path, context, stack)
     (tmp_path / "a.json").write_text('{"name": "something"}')
-    with pytest.raises(InputError, match=r"a\.json: show: is missing: a JSON file is shown as a playlist"):
+    with pytest.raises(InputError, match=r"a\.json: show: is missing; a JSON file must be a playlist"):
         opened(tmp_path / "a.json", context, stack)
 
 
@@ -319,7 +323,7 @@ def test_every_mode_of_colours_is_read(tmp_path: Path, mode: str) -> None:
 
 def test_values_without_a_range_are_refused(tmp_path: Path) -> None:
     Image.fromarray(np.full((20, 20), 0.5, np.float32)).save(tmp_path / "a.tif")
-    with pytest.raises(InputError, match=r"a\.tif: its 32-bit values have no defined range"):
+    with pytest.raises(InputError, match=r"a\.tif: has 32-bit values without a defined range"):
         read_image(tmp_path / "a.tif")
 
 
@@ -351,8 +355,11 @@ def test_what_a_folder_holds_besides_is_left_out_and_named(tmp_path: Path, caplo
     Image.fromarray(solid(RED)).save(tmp_path / "d.tga")
     (tmp_path / "e.mov").write_bytes(b"\0\0\0\x14ftypqt  ")
     assert open_frames(tmp_path, AUTO).count == 2
-    assert "3 of 5 pictures are skipped: a.jxl is JPEG XL" in caplog.text and "b.png is not an image" in caplog.text
-    assert "e.mov is a film: set content.scene to the film itself" in caplog.text
+    assert (
+        "skipping 3 of 5 pictures: a.jxl is JPEG XL" in caplog.text
+        and "b.png cannot be decoded as an image" in caplog.text
+    )
+    assert "e.mov is a film; set content.scene to the film itself" in caplog.text
 
 
 @pytest.mark.parametrize(("kind", "first_ms"), [("GIF", 200), ("WEBP", 200), ("PNG", 200), ("AVIF", 200)])
@@ -373,7 +380,7 @@ def test_an_animation_over_the_limit_is_a_still_and_says_so(tmp_path: Path, monk
     pictures[0].save(tmp_path / "a.gif", save_all=True, append_images=pictures[1:])
     monkeypatch.setattr(LIMITS, "pixels", 2 * 160 * 90)
     assert open_frames(tmp_path / "a.gif", AUTO).count == 1
-    assert "3 frames of 160 x 90 pixels, more than" in caplog.text
+    assert "3 frames of 160 x 90 pixels, which exceeds" in caplog.text
     assert "showing only its first frame" in caplog.text
 
 
@@ -389,7 +396,7 @@ def test_a_picture_that_ends_too_early_is_called_cut_off(tmp_path: Path, suffix:
     data = path.read_bytes()
     path.write_bytes(data[: len(data) * 2 // 3])
     capfd.readouterr()
-    with pytest.raises(InputError, match=rf"a\.{suffix}: .*is cut off"):
+    with pytest.raises(InputError, match=rf"a\.{suffix}: .*is truncated"):
         read_image(path)
     assert capfd.readouterr().err == ""
 
@@ -397,15 +404,15 @@ def test_a_picture_that_ends_too_early_is_called_cut_off(tmp_path: Path, suffix:
 @pytest.mark.parametrize(
     ("data", "told"),
     [
-        (b"\x00\x00\x00\x0cJXL \r\n\x87\n", "is JPEG XL, which is not supported: save it as PNG, JPEG or AVIF"),
-        (b"v/1\x01\x02\x00\x00\x00", "is OpenEXR, which is not supported: its values have no fixed range"),
+        (b"\x00\x00\x00\x0cJXL \r\n\x87\n", "is JPEG XL, which is not supported; save it as PNG, JPEG or AVIF"),
+        (b"v/1\x01\x02\x00\x00\x00", "is OpenEXR, which is not supported; tone-map the picture"),
         (b"8BPS\x00\x01", "is a Photoshop document"),
         (b"II*\x00\x10\x00\x00\x00CR\x02\x00", "is a camera's raw picture"),
         (b"version https://git-lfs.github.com/spec/v1\n", "is a Git LFS pointer"),
         (b'<?xml version="1.0"?><svg/>', "is SVG"),
         (b"<!DOCTYPE html><html>", "is a web page"),
-        (b"PK\x03\x04", "is a ZIP archive, which is not supported: unpack it first"),
-        (b"\x89MCAP0\r\n", "is a recording, which is not supported: it is replayed with --replay"),
+        (b"PK\x03\x04", "is a ZIP archive, which is not supported; unpack it first"),
+        (b"\x89MCAP0\r\n", "is a recording, which is not supported; play it with --replay"),
     ],
 )
 def test_another_kind_is_called_by_its_name_with_the_way_out(tmp_path: Path, data: bytes, told: str) -> None:
@@ -418,7 +425,7 @@ def test_another_kind_is_called_by_its_name_with_the_way_out(tmp_path: Path, dat
 def test_of_a_raw_picture_the_thumbnail_is_not_shown(tmp_path: Path, suffix: str) -> None:
     """A raw file is a TIFF whose first picture is small."""
     Image.fromarray(solid(RED)).save(tmp_path / f"a.{suffix}", "TIFF")
-    with pytest.raises(InputError, match="is a camera's raw picture, which is not supported: develop it"):
+    with pytest.raises(InputError, match="is a camera's raw picture, which is not supported; develop it"):
         open_frames(tmp_path / f"a.{suffix}", AUTO)
 
 
@@ -428,4 +435,4 @@ def test_without_its_extra_a_heic_is_called_so(tmp_path: Path) -> None:
     code += "from runtime.support import picture_header\npicture_header.importlib.util.find_spec = lambda name: None\n"
     code += f"from runtime.support.picture_file import read_image\nread_image(Path({str(path)!r}))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert "a.heic: is HEIC, which the extra `heic` reads (pip install pillow-heif)" in done.stderr
+    assert "a.heic: is HEIC, which requires the extra `heic` (pip install pillow-heif)" in done.stderr

@@ -43,10 +43,14 @@ def test_the_example_is_shown_from_a_folder_of_its_own(tmp_path: Path) -> None:
     ("code", "content", "told"),
     [
         ("", 'scene = "tunnel:Tunnel"\noptions = { radius_m = 9 }', "content.options: radius_m: "),
-        ("", 'scene = "gone:Tunnel"', "content.scene: `gone` cannot be imported from Python's path"),
+        ("", 'scene = "gone:Tunnel"', "content.scene: `gone` cannot be imported: "),
         ("", 'scene = "json:JSONDecoder"', "`json:JSONDecoder` is not a class derived from phasestack.ContentSource"),
-        ("return 1 / 0", 'scene = "own:Own"', "own:Own: unexpected error (ZeroDivisionError: division by zero)"),
-        ("return self", 'scene = "own:Own"', "own:Own: render: must return (height_px, width_px, 4) RGBA, uint8"),
+        ("return 1 / 0", 'scene = "own:Own"', "own:Own: unexpected error: ZeroDivisionError: division by zero"),
+        (
+            "return self",
+            'scene = "own:Own"',
+            "own:Own: render: must return an array (height_px, width_px, 4) of RGBA in uint8",
+        ),
     ],
 )
 def test_a_wrong_one_is_one_line(

@@ -99,7 +99,7 @@ def test_lines_of_its_log_are_ours(tmp_path: Path, stack: PanelStack, caplog: py
     (tmp_path / "a.obj").write_text("mtllib gone.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     with caplog.at_level(logging.INFO):
         prepare_content(ContentSettings(scene=str(tmp_path / "a.obj")), stack)
-    assert "is drawn grey without its materials" in caplog.text
+    assert "drawing the mesh in grey without its materials" in caplog.text
 
 
 def stl(path: Path, count: int) -> Path:
@@ -149,7 +149,7 @@ def deep(folder: Path, width: int, height: int) -> Path:
     ("make", "told", "most"),
     [
         (lambda folder: deep(folder, 8192, 4096), "", 900),  # 21 bytes a pixel; 82 before
-        (lambda folder: deep(folder, 16_384, 8192), "of 16 bits a channel; at most 67,108,864", 200),  # 11 GB
+        (lambda folder: deep(folder, 16_384, 8192), "of 16 bits per channel; the maximum is 67,108,864", 200),  # 11 GB
         (lambda folder: painted(folder, png(16_384, 8192, "RGB")), "", 1300),  # 2.0 GB
         (lambda folder: painted(folder, *[png(4096, 4096)] * 40), "exceeds the limit of 134,217,728", 400),  # 2.8 GB
     ],

@@ -161,7 +161,7 @@ def test_an_unusable_splat_is_left_out_and_a_line_says_so(
     for name in names.split():
         table[name][7] = value
     found = loaded(written(tmp_path, table))
-    assert f"{path}: is drawn without 1 of its 50 splats, which are unusable" in caplog.text
+    assert f"{path}: ignoring 1 of 50 splats because they are not usable" in caplog.text
     for name in ("centres", "covariances", "opacities", "harmonics"):
         assert np.array_equal(getattr(found, name), getattr(kept, name))
 
@@ -258,15 +258,27 @@ def test_a_compressed_file_stands_by_its_format_s_custom(tmp_path: Path, stack: 
 @pytest.mark.parametrize(
     ("name", "change", "told"),
     [
-        ("a.spz", lambda data: data[: len(data) // 2], "is cut off: its header declares 600 splats"),
-        ("a.spz", lambda data: gzip.decompress(data)[:-1], "is cut off: its header declares 600 splats"),
-        ("a.spz", lambda data: b"NGSP\4\0\0\0\1\0\0\0\0\x0c\0\5\0\0\0\1" + bytes(12), "is damaged, or not an SPZ file"),
+        ("a.spz", lambda data: data[: len(data) // 2], "is truncated: the header declares 600 splats"),
+        ("a.spz", lambda data: gzip.decompress(data)[:-1], "is truncated: the header declares 600 splats"),
+        (
+            "a.spz",
+            lambda data: b"NGSP\4\0\0\0\1\0\0\0\0\x0c\0\5\0\0\0\1" + bytes(12),
+            "is damaged or is not an SPZ file",
+        ),
         ("a.spz", lambda data: gzip.compress(b"NGSP" + bytes(40)), "is not an SPZ file of version 1 to 4"),
-        ("a.sog", lambda data: data[:400], "is damaged, or not a SOG file"),
-        ("a.sog", lambda data: data.replace(b'"version": 2', b'"version": 3'), "is damaged, or not a SOG file"),
-        ("a.splat", lambda data: data[:-1], "is cut off, or not a .splat: it has 19199 bytes, not a multiple of 32"),
-        ("a.splat", lambda data: b"", "is cut off, or not a .splat: it has 0 bytes"),
-        ("a.ply", lambda data: data[:-1], "vertex: the file is cut off: 600 are declared, 599 present"),
+        ("a.sog", lambda data: data[:400], "is damaged or is not a SOG file"),
+        ("a.sog", lambda data: data.replace(b'"version": 2', b'"version": 3'), "is damaged or is not a SOG file"),
+        (
+            "a.splat",
+            lambda data: data[:-1],
+            "is truncated or is not a .splat: its size must be a multiple of 32, not 19199 bytes",
+        ),
+        ("a.splat", lambda data: b"", "is truncated or is not a .splat: its size must be"),
+        (
+            "a.ply",
+            lambda data: data[:-1],
+            "vertex: the file is truncated: only 599 of the 600 declared elements are present",
+        ),
         ("a.ply", lambda data: data.replace(b"element chunk", b"element chumk"), "chunk: is missing"),
     ],
 )
@@ -290,26 +302,26 @@ def edited(folder: Path, old: bytes, new: bytes, cut: int = 0) -> Path:
 @pytest.mark.parametrize(
     ("old", "new", "cut", "told"),
     [
-        (b"", b"", 100, "vertex: the file is cut off: 20 are declared, 19 present"),
-        (b"vertex 20", b"vertex 2999999", 0, "element vertex: the file is cut off"),
+        (b"", b"", 100, "vertex: the file is truncated: only 19 of the 20 declared elements are present"),
+        (b"vertex 20", b"vertex 2999999", 0, "element vertex: the file is truncated"),
         (b"vertex 20", b"vertex 3000001", 0, "element vertex: 3,000,001 exceeds the limit of 3,000,000"),
-        (b"vertex 20", b"vertex 0", 0, "vertex: the file has none"),
-        (b"element vertex", b"element corner", 0, "vertex: the header has no format, no vertices"),
+        (b"vertex 20", b"vertex 0", 0, "vertex: the file contains no splats"),
+        (b"element vertex", b"element corner", 0, "vertex: the header declares no format, no vertices"),
         (
             b"property float x",
             b"property list uchar float x",
             0,
-            "vertex: must come before lists, with one number per property",
+            "vertex: must come before any element with lists and have one number per property",
         ),
         (
             b"property float nx",
             b"property float x",
             0,
-            "vertex: the header has no format, no vertices, or one of their properties twice",
+            "vertex: the header declares no format, no vertices, or the same property twice",
         ),
-        (b"property float nx", b"property words nx", 0, "header: not understood: property words nx"),
+        (b"property float nx", b"property words nx", 0, "header: this line is not valid PLY: property words nx"),
         (b"end_header", b"comment", 0, "header: the PLY header is incomplete"),
-        (b"format binary_little_endian 1.0\n", b"", 0, "vertex: the header has no format"),
+        (b"format binary_little_endian 1.0\n", b"", 0, "vertex: the header declares no format"),
         (b"format binary_little_endian", b"format ascii", 0, "format: is ascii"),
     ],
 )

@@ -79,10 +79,10 @@ def test_a_matroska_film_is_laid_out_as_its_tag_says(tmp_path: Path, mode: int, 
 
 def test_stated_stereo_that_is_not_shown_is_logged(tmp_path: Path, caplog: Any) -> None:
     assert len(views_of(film(tmp_path / "a.mkv", pair(), mode=13))) == 1
-    assert "a.mkv: is shown without its second view (stereo mode 13); convert it to side by side" in caplog.text
+    assert "a.mkv: showing the film without its second view (stereo mode 13); convert it to side by side" in caplog.text
     film(tmp_path / "a.mp4", pair(), added=multiview())
     assert len(views_of(tmp_path / "a.mp4")) == 1
-    assert "a.mp4: is shown without its second view (MV-HEVC)" in caplog.text
+    assert "a.mp4: showing the film without its second view (MV-HEVC)" in caplog.text
 
 
 def test_a_sphere_of_360_or_180_degrees_is_recognised(tmp_path: Path) -> None:

@@ -212,7 +212,7 @@ def test_an_empty_configuration_is_no_display_and_status_advises_correctly(pc: P
     pc.done("systemctl daemon-reload; systemctl restart phasestack-x")
     assert eventually(lambda: pc.prop("ActiveState") == "failed")
     told = pc.run("phasestack status").stderr
-    assert "names no monitor" in told and "exit status 2" in told
+    assert "does not name a monitor" in told and "exit status 2" in told
     advice = "sudo systemctl restart phasestack"
     assert told.strip().endswith(advice)
     pc.write("etc/phasestack/phasestack.toml", CONFIG)
@@ -298,7 +298,7 @@ def test_an_upgrade_swaps_the_program_and_goes_back_if_it_cannot_start(pc: Pc) -
     program.write_text(good + "\n\nraise RuntimeError('a bad release')\n")
     failed = pc.run("cd /root/phasestack && make install")
     program.write_text(good)
-    assert failed.returncode != 0 and "the previous one is restored" in failed.stderr
+    assert failed.returncode != 0 and "restoring the previous version" in failed.stderr
     assert eventually(lambda: pc.is_active("phasestack") and pc.shows(), within_s=90)
     assert not list((pc.root / "opt/phasestack").glob("lib.*"))
 
@@ -333,9 +333,9 @@ def small_disk(owner: str) -> str:
 
 
 def test_it_is_uninstalled_twice_and_says_what_it_leaves(pc: Pc) -> None:
-    assert "left: /etc/phasestack" in pc.done("cd /root/phasestack && make uninstall")
+    assert "kept /etc/phasestack" in pc.done("cd /root/phasestack && make uninstall")
     pc.done("systemctl stop systemd-udevd systemd-udevd-control.socket systemd-udevd-kernel.socket")
-    assert "left: the user and group" in pc.done("cd /root/phasestack && PURGE=yes make uninstall")
+    assert "kept the user and group" in pc.done("cd /root/phasestack && PURGE=yes make uninstall")
     assert pc.run("systemctl is-active phasestack phasestack-page phasestack-x").stdout.count("active\n") == 3
     left = pc.done("find /etc /usr /opt /run /var/lib -xdev -name '*phasestack*' -not -path '*.service.d*'")
     assert left == ""

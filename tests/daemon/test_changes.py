@@ -139,7 +139,7 @@ def broken_content(folder: Path, broken: str) -> Path:
     return path
 
 
-BROKEN = {"NaN": "vertices: 1 of 3", "missing": "neither a file", "a list": "show[1]: content: scene: "}
+BROKEN = {"NaN": "vertices: 1 of 3", "missing": "not a file", "a list": "show[1]: content: scene: "}
 
 
 def test_content_that_can_t_be_loaded_is_refused_and_the_old_stays(
@@ -179,7 +179,7 @@ def test_a_newer_scene_overtakes_one_that_is_being_loaded(served: Served, gate: 
     first, answers = loading(served, "texture")
     assert served.asked("scene", "sparse", meanwhile=gate.set)["ok"]
     first.join(30.0)
-    assert answers == [{"ok": False, "error": "skipped in favour of a newer change"}]
+    assert answers == [{"ok": False, "error": "superseded by a newer change"}]
     assert served.rig.content.info.name == "sparse"
 
 
@@ -248,7 +248,10 @@ def test_a_reload_refuses_what_is_read_only_at_the_start(
     """`[loop]` and `calibration.ipd_m` were accepted, and changed nothing."""
     served.config.write_text(configuration(**change))
     answer = served.asked("reload")
-    assert answer == {"ok": False, "error": f"reload: {name}: cannot change while the service runs; restart it"}
+    assert answer == {
+        "ok": False,
+        "error": f"reload: {name}: cannot change while the service is running; restart the service",
+    }
 
 
 def test_only_the_presenter_s_thread_writes_what_was_chosen(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -277,7 +280,7 @@ def test_a_command_that_fails_unexpectedly_is_refused_and_the_run_continues(
     answer = served.asked("place", {"scale": 2.0})
     assert answer == {"ok": False, "error": "unexpected error (OverflowError); see the log"}
     (line,) = (TextFormat(journald=False).format(record) for record in caplog.records if record.exc_info)
-    assert "place: unexpected error (OverflowError: int too large" in line and line.count("unexpected") == 1
+    assert "place: unexpected error: OverflowError: int too large" in line and line.count("unexpected") == 1
     assert all(account.presented for account in served.rig.refreshes(3))
     assert served.asked("pause")["paused"] is True
 
@@ -327,7 +330,7 @@ def test_a_scene_that_never_loads_is_refused_and_never_shown(
 
     monkeypatch.setattr(LIMITS, "load_s", 0.0)
     answer = served.asked("scene", "slow_scene:Scene", meanwhile=meanwhile)
-    assert not answer["ok"] and "so the solver was restarted; nothing has changed" in answer["error"]
+    assert not answer["ok"] and "so the solver was restarted with the old settings" in answer["error"]
     rig.refresh_until_solved()
     content, (hung,) = rig.content, solver._hung
     slow.GATE.set()
@@ -411,9 +414,7 @@ def test_changes_load_one_at_a_time_and_only_the_newest_waits(served: Served, mo
     asking.start()
     served.rig.refresh_until(lambda: len(answers) == len(names))
     assert at_once[1] == 1 and len(begun) <= 4
-    assert [answer.get("error", "") for answer in answers].count("skipped in favour of a newer change") == len(
-        names
-    ) - 1
+    assert [answer.get("error", "") for answer in answers].count("superseded by a newer change") == len(names) - 1
     assert served.status()["model"] == "sart"
 
 

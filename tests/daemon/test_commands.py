@@ -68,14 +68,14 @@ def test_a_loop_that_stands_still_is_a_failure(server: StatusServer, clock: Simu
     clock.advance_ns(6 * NS_PER_S)
     result = ask_status(server.path)
     assert result.exit_code == 1
-    assert "the display loop has hung for 6 s" in result.stderr
+    assert "the display loop has not responded for 6 s" in result.stderr
 
 
 def test_without_a_daemon_status_fails_with_one_line(tmp_path: Path) -> None:
     result = ask_status(tmp_path / "none.sock")
     assert result.exit_code == 1
     assert result.stderr.count("\n") == 1
-    assert "no daemon; start one with `phasestack run`" in result.stderr
+    assert "no daemon is listening; start one with `phasestack run`" in result.stderr
 
 
 @pytest.mark.parametrize(
@@ -85,7 +85,7 @@ def test_without_a_daemon_status_fails_with_one_line(tmp_path: Path) -> None:
         (
             "failed",
             "exit-code",
-            "exit status 2: a.toml: stack: no); fix this, then run: sudo systemctl restart phasestack",
+            "exit status 2: a.toml: stack: no); fix the error, then run: sudo systemctl restart phasestack",
         ),
         ("failed", "start-limit-hit", "sudo systemctl reset-failed phasestack"),
         ("activating", "success", "journalctl -u phasestack"),

@@ -77,7 +77,7 @@ def test_an_endless_model_is_refused_and_hangs_no_thread_of_the_daemon(
     monkeypatch.setattr(reconfigure, "MODEL_S", 10.0)
     with Served(tmp_path) as served:
         answer = served.asked("model", str(endless))
-        assert not answer["ok"] and answer["error"].endswith("endless.onnx: is not ready after 10 s")
+        assert not answer["ok"] and answer["error"].endswith("endless.onnx: was not loaded within 10 s")
         assert not [thread for thread in threading.enumerate() if thread.name.startswith("job reconf")]
         served.rig.refresh_until_solved()
 

@@ -91,7 +91,7 @@ def test_contexts_lost_by_the_panels_are_remade_with_the_solver_without_leaks(
         for loss in range(losses):
             parts, lost = rig.run.parts, rig.presenter.panels.contexts_lost
             with monkeypatch.context() as reset:
-                reset.setattr("runtime.panels.window._reset_status", lambda: "was reset (0x8253)")
+                reset.setattr("runtime.panels.window._reset_status", lambda: "the driver reset the GPU (0x8253)")
                 rig.refresh_until(lambda: "panel" in rig.presenter.missing)
             assert rig.presenter.panels.contexts_lost == lost + 1
             rig.refresh_until(lambda before=parts: rig.run.parts is not before and not rig.presenter.missing)

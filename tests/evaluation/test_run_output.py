@@ -62,7 +62,7 @@ def test_the_sheet_shows_the_moment_with_the_one_figure_to_quote(
     assert written[0] == "PSNR 33.2 dB at the eyes (pixels as squares, pupil 4 mm, tracking error 1 mm)"
     assert "This moment" in written
     whole = " ".join(written)  # long lines are wrapped
-    assert "while the head moved, PSNR 22.3 dB at the true eyes (live), delays included" in whole
+    assert "while the head moved, the live PSNR at the true eyes was 22.3 dB, including delays" in whole
     assert len(re.findall(r"\d dB", whole)) == 2  # this refresh's, and the run's
     np.testing.assert_array_equal(read_image(tmp_path / "layer-0.png"), layers[0, ..., :3])  # the last frame's
     page = (tmp_path / "viewer.html").read_text(encoding="utf-8")

@@ -89,7 +89,7 @@ def test_without_a_file_the_sensor_is_looked_at(tmp_path: Path) -> None:
     done = eyes("--json")
     row, *_ = json.loads(done.stdout)["pictures"]
     assert done.exit_code == 0 and row["eyes_px"] is None and len(row["eyes_m"]) == 2
-    assert row["reason"] == "this sensor delivers eyes, not pictures"
+    assert row["reason"] == "this sensor delivers eye positions but no pictures"
     config = tmp_path / "end.toml"
     write_motion(tmp_path / "second.mcap", "still", seconds=1.0)
     config.write_text('[sensor]\nsource = "second.mcap"\n')

@@ -141,7 +141,7 @@ def test_what_is_no_viewer_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     colour, depth, _ = scene(intrinsics=CAMERA)
     finder = EyeFinder()
     assert finder.find(frame(colour, depth, CAMERA)) is None and finder.reason == "no face"
-    assert finder.find(SensorFrame(1, 1)) is None and "no colour" in finder.reason
+    assert finder.find(SensorFrame(1, 1)) is None and "not deliver colour" in finder.reason
     colour, depth, _ = scene(np.array([0.0, 0.0, 2.5]), intrinsics=camera(), wall_m=6.0)
     monkeypatch.setattr("runtime.eyes.detect.RANGE_MAX_M", 2.0)
-    assert finder.find(frame(colour, depth, camera())) is None and "beyond 2 m" in finder.reason
+    assert finder.find(frame(colour, depth, camera())) is None and "the maximum is 2 m" in finder.reason

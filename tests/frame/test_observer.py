@@ -235,7 +235,7 @@ def test_the_moment_shown_is_the_last_or_in_real_time_newest_measured(content: C
             if not simulated and number == 0:
                 observer._sampler._every = 100
         observer.finish()
-        assert observer.moment is not None and observer.moment.lines[0].startswith(f"Refresh {shown};")
+        assert observer.moment is not None and observer.moment.lines[0].startswith(f"Refresh {shown}:")
         np.testing.assert_array_equal(observer.moment.eye_views.eyes_m, aside(0.001 * shown))
 
 
@@ -308,7 +308,7 @@ def test_a_few_samples_that_came_meanwhile_are_measured_at_the_end(content: Cont
     observer.finish()
     last = 2 * sampling.HELD_MAX - 1
     assert set(observer.live_errors) > {0, last} and len(observer.live_errors) == 1 + sampling.HELD_MAX
-    assert observer.moment is not None and observer.moment.lines[0].startswith(f"Refresh {last};")
+    assert observer.moment is not None and observer.moment.lines[0].startswith(f"Refresh {last}:")
 
 
 def test_comparing_is_not_the_presenter_s_nor_the_solver_s_work(
@@ -486,6 +486,6 @@ def test_who_stops_a_run_waits_for_no_kept_picture(
         observer.sampled(sample(NS_PER_S + number * PERIOD_NS))
         observer.refreshed(refresh(number, solved))
     observer.finish(lambda: True)
-    assert "3 of 3 refreshes with kept light have no" in caplog.text
+    assert "3 of 3 refreshes kept by --keep-light have no" in caplog.text
     assert all({"layers", "info"} <= light.keys() for light in kept.lights.values())
     assert kept.lights[2]["info"]["true_eyes_m"] is not None

@@ -73,7 +73,7 @@ def test_eyes_too_far_off_are_aligned_as_far_as_possible(stage: Stage) -> None:
     stage.refresh(30)
     machine = stage.presenter.machine
     assert machine.state is State.TRACKING
-    assert "alignment at its limit" in machine.reason
+    assert "the alignment has reached its limit" in machine.reason
     assert "too far to align" in machine.reason
     assert np.isfinite(stage.panels.frame.solved_from_shown[0]).all()
     stage.solver.hand_over(solved=solution(7, aside(3.0)))
@@ -323,7 +323,7 @@ def test_a_solution_ran_at_its_first_refresh_and_is_reused_later(stage: Stage) -
 
 def test_frames_are_numbered_and_counted_and_a_run_ends_after_so_many(stage: Stage) -> None:
     begun = stage.presenter.stats.frames
-    assert stage.presenter.run(frames=begun + 5) == f"{begun + 5} frames done"
+    assert stage.presenter.run(frames=begun + 5) == f"reached the limit of {begun + 5} frames"
     assert [done.account.frame for done in stage.watching.refreshes] == list(range(begun + 5))
     assert stage.presenter.machine.state is State.STOPPING
 

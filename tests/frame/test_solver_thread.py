@@ -158,7 +158,7 @@ def test_waiting_for_a_solver_that_is_never_ready_can_be_ended() -> None:
     gate = threading.Event()
     made: Any = lambda: FakeParts(lambda _: SolverUpdate()) if gate.wait(PATIENCE_S) else None  # noqa: E731
     host = SolverThread(made, MonotonicClock())
-    with pytest.raises(FatalError, match=r"not ready after 0\.2 s"):
+    with pytest.raises(FatalError, match=r"not ready within 0\.2 s"):
         host.wait_ready(max_s=0.2)
     told: list[None] = []
     host.wait_ready(lambda: bool(told.append(None)))  # answers False
@@ -317,7 +317,7 @@ def test_a_task_that_raises_is_done_and_nothing_else_is_lost(shop: Workshop, cap
     shop.settle()
     shop.solve(1)
     assert shop.host.news().solution.solved_for_ns == 1
-    assert sum("a task failed" in record.getMessage() for record in caplog.records) == 1
+    assert sum("a task of the solver failed" in record.getMessage() for record in caplog.records) == 1
 
 
 def test_a_task_is_asked_again_after_every_step_until_it_is_done(shop: Workshop) -> None:

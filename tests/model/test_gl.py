@@ -198,7 +198,9 @@ def test_a_panel_wider_than_the_driver_allows_is_refused(gl: GlBackend) -> None:
     stack = replace(STACK, width_px=widest + 8)
     predictor = load_predictor("fast", STACK)
     assert isinstance(predictor, StepPredictor)
-    with pytest.raises(InputError, match=rf"stack: width_px: {widest + 8}: this OpenGL driver allows {widest}"):
+    with pytest.raises(
+        InputError, match=rf"stack: width_px: is {widest + 8}, but this OpenGL driver allows at most {widest}"
+    ):
         choose("gl", predictor.on_panels(stack), lambda: gl.passes.context)
 
 
@@ -229,12 +231,12 @@ def test_automatic_takes_the_faster_one_and_says_what_was_measured(gl: GlBackend
 
 def test_without_opengl_automatic_is_the_processor_and_gl_is_refused() -> None:
     def nothing() -> Any:
-        raise MissingPart("no OpenGL without a screen")
+        raise MissingPart("cannot create an OpenGL context without a screen")
 
     predictor = load_predictor("fast", STACK)
     choice = choose("auto", predictor, nothing)
     assert choice.backend.name == "cpu"
-    assert "no OpenGL" in choice.why
+    assert "OpenGL is not available" in choice.why
     with pytest.raises(MissingPart):
         choose("gl", predictor, nothing)
 

@@ -193,10 +193,10 @@ def test_the_published_network_learns_from_a_folder_of_its_pictures(tmp_path: Pa
     [
         ({"options": {"steps": 65}}, "my_network:MyNetwork: steps"),
         ({"data": "/nowhere/lego_bulldozer"}, "is not a folder"),
-        ({"data": "/nowhere/unnamed"}, "contains none of"),
+        ({"data": "/nowhere/unnamed"}, "name must contain one of"),
         ({"arch": "tests.model_export.unservable:NotFinite", "options": {}}, "not finite"),
         ({"options": {"width": 8, "depth": 3}}, "--option: depth"),
-        ({"arch": "balanced", "options": {}}, "'balanced' is neither eyereal, unrolled nor module:Class"),
+        ({"arch": "balanced", "options": {}}, "'balanced' is not a network; use eyereal, unrolled or module:Class"),
     ],
 )
 def test_what_cannot_be_trained_is_refused_before_anything_is_written(

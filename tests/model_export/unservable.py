@@ -9,7 +9,7 @@ from pydantic import BaseModel, Field
 from torch import nn
 
 FAULTS = {
-    "absent:Module": "`absent` cannot be imported from Python's path",
+    "absent:Module": "`absent` cannot be imported: ",
     "tests.model_export.unservable:Absent": "is not a class derived from torch.nn.Module",
     "tests.model_export.unservable:WrongInput": "expected input",
     "tests.model_export.unservable:WrongOutput": "channels (3 panels of 3 colours)",

@@ -136,7 +136,7 @@ say("reached by tab", reached);
 
 // The daemon hangs, dies and comes back.
 await parent("freeze");
-say("it says that the daemon hangs", (await until(() => page.isVisible("#gone"))) && (await shows("#state", "hangs")));
+say("it says that the daemon hangs", (await until(() => page.isVisible("#gone"))) && (await shows("#state", "not responding")));
 await parent("thaw");
 say("it goes on when it hangs no more", await until(() => page.isHidden("#gone")));
 await parent("kill");

@@ -156,7 +156,7 @@ def test_wishes_reach_the_daemon_and_its_refusals_the_page(page: Page, loop: Loo
     code, answer = page.tell("place", "much")
     assert (code, answer["error"]) == (
         409,
-        "value: place requires an object of settings, or null for the configured ones",
+        "value: place requires an object of settings, or null to restore the configured placement",
     )
     assert loop.told == [("scene", "grey"), ("place", {"scale": 2.0}), ("scene", "missing")]
 
@@ -174,7 +174,7 @@ def test_a_daemon_that_hangs_is_not_taken_for_none(page: Page, folder: Path) -> 
         silent.bind(str(folder / "s.sock"))
         silent.listen()
         assert eventually(lambda: page.look_up("status").get("hangs") is True)  # answers are kept for a moment
-        assert "the daemon hangs" in page.look_up("status")["error"]
+        assert "the daemon did not answer in time" in page.look_up("status")["error"]
     (folder / "s.sock").unlink()
     assert eventually(lambda: page.look_up("status")["hangs"] is False)
 
@@ -245,7 +245,7 @@ def test_connections_that_ask_nothing_shut_nobody_out(page: Page, loop: Loop) ->
 @pytest.mark.parametrize(
     ("text", "mode", "problem"),
     [
-        ("a" * 40, 0o640, "is readable by others"),
+        ("a" * 40, 0o640, "can be read by other users"),
         ("short", 0o600, "must contain a token"),
         ("", 0o600, "must contain a token"),
     ],

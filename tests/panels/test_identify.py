@@ -150,5 +150,5 @@ def test_the_doctor_names_a_panel_whose_monitor_is_missing(
     result = invoke(doctor, "--json", "--config", config)
     failed = {check["name"]: check for check in json.loads(result.stdout)["checks"] if check["state"] == "fail"}
     assert result.exit_code == 1
-    assert "panel 1: no monitor with EDID serial ANOTHER" in failed["panels"]["detail"]
+    assert "panel 1: no monitor has EDID serial ANOTHER" in failed["panels"]["detail"]
     assert "identify" in failed["panels"]["remedy"]

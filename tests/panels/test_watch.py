@@ -59,7 +59,7 @@ def comes_back(x: XServer, sink: WindowPanels, *monitors: int) -> bool:
     [
         (("XDestroyWindow",), "panel 1: the window was destroyed"),
         (("XUnmapWindow",), "panel 1: the window was unmapped"),
-        (("XMoveWindow", 600, 7), "panel 1: the window is 320x180+600+7, not 320x180+0+0"),
+        (("XMoveWindow", 600, 7), "panel 1: the window is at 320x180+600+7, but must be at 320x180+0+0"),
     ],
 )
 def test_windows_taken_or_moved_are_lost_panels_and_come_back(

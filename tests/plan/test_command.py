@@ -34,7 +34,7 @@ def test_it_says_what_is_left_out_with_time_and_error() -> None:
     ("eyes", "said"),
     [
         ("[-0.6, -0.03, 0], [-0.6, 0.03, 0]", "not in front of the panels"),
-        ("[0.061, 40, 0], [0.061, 40.06, 0]", "no part of the display is visible"),
+        ("[0.061, 40, 0], [0.061, 40.06, 0]", "cannot see any part of the display"),
     ],
 )
 def test_fixed_eyes_that_see_nothing_are_one_line(tmp_path: Path, eyes: str, said: str) -> None:
@@ -66,9 +66,9 @@ def test_what_reuse_costs_agrees_with_what_is_shown_after_the_drift() -> None:
 @pytest.mark.parametrize(
     ("option", "name", "told"),
     [
-        ("--scene", "textures", "plan: --scene: `textures` is neither .* did you mean texture"),
-        ("--scene", "nosuch", "17 presets, such as lego_bulldozer"),
-        ("--scene", "street", "content: file: is missing: street's .ply, .glb or data-set folder"),
+        ("--scene", "textures", "plan: --scene: `textures` is not a file.* did you mean texture"),
+        ("--scene", "nosuch", "17 presets such as lego_bulldozer"),
+        ("--scene", "street", "content: file: is missing; set it to the .ply, .glb or data-set folder of street"),
         ("--model", "nosuch", "plan: --model: 'nosuch'"),
     ],
 )

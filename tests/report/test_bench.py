@@ -60,10 +60,10 @@ def test_a_change_beyond_noise_is_worse_if_slower_and_better_if_faster(old: Any,
 def test_lost_light_and_memory_are_named() -> None:
     found = texts(regression_file(), regression_file(light=41.5))
     assert [worse for worse, _ in found] == [True] * 5
-    assert "-0.50 dB of light, at a tracking error of 1 mm" in [text for _, text in found]
+    assert "-0.50 dB of light PSNR at a tracking error of 1 mm" in [text for _, text in found]
     alone = regression_file()
     alone["methods"][0]["light_db"]["1"] -= 0.5
-    assert texts(regression_file(), alone) == [(True, "-0.50 dB of light, at a tracking error of 1 mm")]
+    assert texts(regression_file(), alone) == [(True, "-0.50 dB of light PSNR at a tracking error of 1 mm")]
     more = regression_file()
     more["methods"][0]["memory_mib"] = 300.0
     assert texts(regression_file(), more) == [(True, "1.50 times the memory")]

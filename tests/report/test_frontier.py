@@ -99,5 +99,5 @@ def test_a_measurement_process_answers_refuses_or_is_reported_dead() -> None:
     assert apart(echo, 7) == 7
     with pytest.raises(FatalError, match="file: field: is wrong"):
         apart(refuse)
-    with pytest.raises(FatalError, match="die: the measuring process has died"):
+    with pytest.raises(FatalError, match="die: the measuring process died"):
         apart(die)

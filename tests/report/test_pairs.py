@@ -64,14 +64,14 @@ def test_other_json_files_are_ignored_and_views_off_the_eyes_optional(tmp_path: 
         ({"eyes": [[10**320, 0.0, 0.1], [0.7, 0.1, 0.1]]}, "case.json: eyes.0.0"),
         ({"images": ["left.png"]}, "case.json: images"),
         ({"images": ["left.png", "none.png"]}, "none.png: cannot be read"),
-        ({"images": ["left.png", "small.png"]}, "differ in size"),
+        ({"images": ["left.png", "small.png"]}, "must have the same size"),
         ({"panels": {"width_m": 0.5, "height_m": 0.3, "x_m": [0.1, 0.0]}}, "panels: x_m"),
         ({"panels": {"width_m": -1, "height_m": 0.3, "x_m": [0.0, 0.1]}}, "panels: width_m"),
         ({"panels": 3}, "case.json: panels"),
         ({"off": [{"mm": 2}]}, "case.json: off"),
         ({"off": [{"mm": 2, "eye": [1, 2], "image": "off.png"}]}, "case.json: off.0.eye"),
         ({"off": [{"mm": 10**320, "eye": [1, 2, 3], "image": "off.png"}]}, "case.json: off.0.mm"),
-        ({"off": [{"mm": 2, "eye": [1, 2, 3], "image": "small.png"}]}, "small.png: differs in size"),
+        ({"off": [{"mm": 2, "eye": [1, 2, 3], "image": "small.png"}]}, "small.png: must have the same size"),
     ],
 )
 def test_a_mistake_in_a_case_file_is_named(tmp_path: Path, changes: dict[str, Any], complaint: str) -> None:

@@ -72,7 +72,7 @@ def test_a_report_that_is_stopped_is_a_page_with_what_was_measured(tmp_path: Pat
     assert [method["name"] for method in record["methods"]] == ["balanced"]
     assert record["complete"] is False and record["methods"][0]["light_db"]["1"] > 10
     page = (tmp_path / "out" / "index.html").read_text()
-    assert "Not finished" in page and page.count("data:image/png;base64,") == 1
+    assert "This report is not finished" in page and page.count("data:image/png;base64,") == 1
 
 
 @pytest.mark.slow

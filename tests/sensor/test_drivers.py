@@ -64,7 +64,7 @@ def test_the_example_delivers_from_a_folder_of_its_own_with_its_covariance(tmp_p
         ({"driver": "udp_eyes:UdpEyes", "options": {"port": 99999}}, "sensor.options: port: "),
         ({"driver": "udp_eyes:UdpEyes"}, "sensor.options: port: "),
         ({"driver": "udp_eyes:UdpEyes", "options": {"port": 9, "noise": 1}}, "sensor.options: noise: is not a setting"),
-        ({"driver": "gone:UdpEyes"}, "sensor.driver: `gone` cannot be imported from Python's path"),
+        ({"driver": "gone:UdpEyes"}, "sensor.driver: `gone` cannot be imported: "),
         ({"driver": "json:JSONDecoder"}, "`json:JSONDecoder` is not a class derived from phasestack.Sensor"),
         ({"driver": "openni"}, "did you mean openni2?"),
     ],

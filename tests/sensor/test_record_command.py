@@ -39,7 +39,7 @@ def test_a_recording_of_the_demo_has_its_samples(tmp_path: Path) -> None:
     summary = json.loads(answer.stdout)
     frames = list(Recording(out).samples())
     assert answer.exit_code == 0 and summary["samples"] == len(frames) and 25 <= len(frames) <= 31
-    assert summary["seconds"] <= 1.0 and summary["stopped"] == "the time is up"
+    assert summary["seconds"] <= 1.0 and summary["stopped"] == "reached the time limit"
     assert frames[0].eyes is not None and frames[0].true_eyes_m is not None
 
 
@@ -137,7 +137,7 @@ def test_a_forbidden_place_is_refused_in_one_line(folder: str) -> None:
         finally:
             os.seteuid(0)
     assert isinstance(answer.exception, InputError)
-    assert "cannot be written (Permission denied)" in str(answer.exception)
+    assert "cannot be written: Permission denied" in str(answer.exception)
 
 
 def test_images_of_a_sensor_that_has_none_are_not_claimed(tmp_path: Path) -> None:

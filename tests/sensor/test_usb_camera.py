@@ -50,7 +50,7 @@ def test_without_depth_the_eyes_direction_is_right_with_sigma_along_it(film: str
 
 
 def test_what_is_no_camera_is_told() -> None:
-    with pytest.raises(InputError, match="fov_deg: is required"):
+    with pytest.raises(InputError, match="fov_deg: must be set"):
         open_sensor(SensorSettings(driver="usb-camera"), MonotonicClock())
     for source in ("tcp://127.0.0.1:9?listen=1", "concat:a.avi|b.avi"):  # one that listens, one that opens others
         with pytest.raises(InputError, match=r"source: [a-z]+ is not supported; use one of rtsp, rtsps, http, https"):

@@ -79,12 +79,21 @@ def ends(how: str) -> None:
     [
         ("refused", "b.bin: uri: is not there"),
         ("disk", "b.bin: cannot be read (failed)"),
-        ("bug", "a.glb: cannot be read (KeyError: 'x')"),
-        ("memory", "a.glb: needs more than 512 MiB to read or crashes the process that reads it (1)"),
-        ("hidden memory", "a.glb: needs more than 512 MiB to read or crashes the process that reads it (1)"),
-        ("abort", "a.glb: needs more than 512 MiB to read or crashes the process that reads it (-6)"),
-        ("exit", "a.glb: needs more than 512 MiB to read or crashes the process that reads it (1)"),
-        ("hang", "a.glb: is not ready after 3 s"),
+        ("bug", "a.glb: cannot be read: KeyError: 'x'"),
+        (
+            "memory",
+            "a.glb: needs more than 512 MiB of memory or crashed the process that read the file (exit status 1)",
+        ),
+        (
+            "hidden memory",
+            "a.glb: needs more than 512 MiB of memory or crashed the process that read the file (exit status 1)",
+        ),
+        (
+            "abort",
+            "a.glb: needs more than 512 MiB of memory or crashed the process that read the file (exit status -6)",
+        ),
+        ("exit", "a.glb: needs more than 512 MiB of memory or crashed the process that read the file (exit status 1)"),
+        ("hang", "a.glb: was not loaded within 3 s"),
     ],
 )
 def test_whatever_ends_it_is_one_line(how: str, line: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -134,7 +143,7 @@ def test_who_listens_ends_it_and_it_is_gone(tmp_path: Path, work: Any) -> None:
 def test_no_process_at_the_moment_passes(monkeypatch: pytest.MonkeyPatch) -> None:
     opened = set(Path("/proc/self/fd").iterdir())
     monkeypatch.setattr(child.sys, "executable", "/nowhere/python")
-    with pytest.raises(TransientError, match=r"a\.glb: no process can be started to read it"):
+    with pytest.raises(TransientError, match=r"a\.glb: cannot start a process to read the file"):
         run(arrays, 1)
     assert set(Path("/proc/self/fd").iterdir()) == opened
 

@@ -179,4 +179,4 @@ def test_a_repeated_message_is_suppressed_and_counted_and_others_pass(file: File
     assert len(lines) == BURST + 100 + 1 and sum("state:" in line for line in lines) == 100
     clock.advance_ns(60 * NS_PER_S)
     log.warning("model failed, %d", 100)
-    assert f"({100 - BURST} more like this were not shown)" in file.getvalue().splitlines()[-1]
+    assert f"({100 - BURST} similar messages suppressed)" in file.getvalue().splitlines()[-1]

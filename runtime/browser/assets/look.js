@@ -3,16 +3,16 @@
 import { Display, alignment, unaligned, drawPlan, middle, moved, reach } from "/display.js";
 
 const MODES = [ // key, name, group, hint
-  ["wiggle", "Wiggle", "Eyes", "Alternates between both eyes' pictures: the nearest parts jump most."],
-  ["parallel", "Side by side", "Eyes", "Look through the screen: the left picture is for the left eye."],
-  ["crossed", "Crossed", "Eyes", "Cross your eyes: the left picture is for the right eye."],
-  ["anaglyph", "Red and cyan", "Eyes", "For glasses with a red left and a cyan right glass."],
+  ["wiggle", "Wiggle", "Eyes", "Alternates between the two eyes' pictures. The nearest parts jump most."],
+  ["parallel", "Side by side", "Eyes", "Look through the screen. The left picture is for the left eye."],
+  ["crossed", "Crossed", "Eyes", "Cross your eyes. The left picture is for the right eye."],
+  ["anaglyph", "Red and cyan", "Eyes", "For glasses with a red left lens and a cyan right lens."],
   ["left", "Left eye", "Eyes", ""],
   ["right", "Right eye", "Eyes", ""],
-  ["panels", "Each panel", "Panels", "What each panel shows, rear to front."],
-  ["apart", "Drawn apart", "Panels", "One point of the picture and the rays from it to each eye. Point elsewhere to move it."],
+  ["panels", "Each panel", "Panels", "What each panel shows, from rear to front."],
+  ["apart", "Drawn apart", "Panels", "One point of the picture and its rays to the two eyes. Point elsewhere to choose another."],
   ["target", "Target", "Check", "What each eye should see from the head position the layers were solved for."],
-  ["difference", "Difference × 8", "Check", "What each eye sees minus what it should see; black is perfect. For the head position the layers were solved for."],
+  ["difference", "Difference × 8", "Check", "What each eye sees minus what it should see, from the head position the layers were solved for. Black is perfect."],
 ];
 const KEYS = { ArrowLeft: [0, -1, 0], ArrowRight: [0, 1, 0], ArrowUp: [0, 0, 1], ArrowDown: [0, 0, -1], "+": [-2, 0, 0], "-": [2, 0, 0] };
 // Without a GPU, drawing takes processor time away from the solver, so while the head moves, pictures are drawn less
@@ -24,11 +24,11 @@ const STEP_M = 0.005, REACH_M = [0.5, 0.3];
 // SAMPLED: light is measured at every SAMPLED-th pixel in both directions.
 const REST_MS = 200, REST_RAYS = 5, STRIPS = 12, WIGGLE_MS = 280, REPORT_MS = 120, SAMPLED = 12;
 const PAGE = `
-<div class="stage"><canvas tabindex="0" aria-label="What the eyes see. Arrow keys move the head, + and - bring it nearer and farther."></canvas>
+<div class="stage"><canvas tabindex="0" aria-label="What the eyes see. Arrow keys move the head; + and - move it nearer and farther."></canvas>
 <svg class="over" aria-hidden="true"></svg><div class="names" aria-hidden="true"></div><p class="notice" role="status" hidden></p></div>
-<aside><h1></h1><p class="how">The pointer (or a finger, or the arrow keys) is your head; the wheel brings it nearer.</p><div class="modes"></div><p class="hint"></p>
+<aside><h1></h1><p class="how">Move your head with the pointer, a finger or the arrow keys. The wheel moves it nearer.</p><div class="modes"></div><p class="hint"></p>
 <div class="switches"><label><input type="checkbox" data-key="aligned" checked> outer panels follow the head</label>
-<label><input type="checkbox" data-key="pupil"> pupils 4 mm wide</label><button type="button" class="quiet">Head back</button></div>
+<label><input type="checkbox" data-key="pupil"> pupils 4 mm wide</label><button type="button" class="quiet">Reset head</button></div>
 <p class="head" role="status"></p><p class="light"></p><div class="point"></div>
 <div class="views"><figure><svg data-axis="1" viewBox="0 0 320 170" role="img" aria-label="Eyes and panels from above"></svg><figcaption>from above</figcaption></figure>
 <figure><svg data-axis="2" viewBox="0 0 320 170" role="img" aria-label="Eyes and panels from the side"></svg><figcaption>from the side</figcaption></figure></div>
@@ -269,7 +269,7 @@ export class Look {
   // Return a line of text that gives the panel values along a ray and the resulting light.
   #sum(kind, codes) {
     const line = node("p", `${kind} eye: `, kind);
-    if (codes.includes(null)) return line.append("misses a panel"), line;
+    if (codes.includes(null)) return line.append("the ray misses a panel"), line;
     const swatch = (rgb) => {
       const made = node("i");
       made.style.background = `rgb(${rgb.map(Math.round)})`;
@@ -278,7 +278,7 @@ export class Look {
     const seen = [0, 1, 2].map((k) => 255 * Math.sin((codes.reduce((sum, c) => sum + c[k], 0) / 255) * (Math.PI / 2)) ** 2);
     const turns = codes.map((c) => Math.round((c[1] / 255) * 90));
     codes.forEach((code, n) => line.append(n ? " + " : "", swatch(code)));
-    line.append(" → ", swatch(seen), node("small", ` green: ${turns.join("° + ")}° of turn, sin² = ${((100 * seen[1]) / 255).toFixed(0)}% of the light`));
+    line.append(" → ", swatch(seen), node("small", ` green: ${turns.join("° + ")}° of rotation, sin² = ${((100 * seen[1]) / 255).toFixed(0)}% of the light`));
     return line;
   }
 
@@ -291,7 +291,7 @@ export class Look {
     const parts = [[y, "to the right", "to the left"], [z, "up", "down"], [x, "farther", "nearer"]].filter(([v]) => mm(v));
     const where = parts.length ? `The head is ${parts.map(([v, one, other]) => `${mm(v)} mm ${v > 0 ? one : other}`).join(", ")} from where the layers were solved for` : "The head is where the layers were solved for";
     if (this.state) return void (this.$(".head").textContent = this.state);
-    const limit = limited ? `; the outer panels could follow only part of the way: ${limited}` : "";
+    const limit = limited ? `; the outer panels stop part of the way because the head is ${limited}` : "";
     this.$(".head").textContent = `${where}${limit}.`;
   }
 
@@ -319,7 +319,7 @@ export class Look {
     this.light_db = -10 * Math.log10(Math.max(error / counted - (scene.target_error ?? 0), 1e-9));
     const words = this.light_db > 33 ? "hard to distinguish from the target" : this.light_db > 27 ? "a good picture with faint traces of the other layers" :
       this.light_db > 21 ? "obvious ghosts and coloured edges" : "the layers fall apart";
-    this.$(".light").textContent = `Light reaching both eyes here: ${this.light_db.toFixed(1)} dB against the target: ${words}.`;
+    this.$(".light").textContent = `Light at both eyes: ${this.light_db.toFixed(1)} dB against the target (${words}).`;
   }
 
   #modes() {

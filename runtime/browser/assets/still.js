@@ -17,7 +17,7 @@ const halves = async (text) => {
 async function begin() {
   const scene = read("scene"), layers = await Promise.all(read("layers").map(image));
   const wanted = await Promise.all(read("wanted").map(image)).catch(() => {
-    scene.lines.push("This browser can't read AVIF, the format of this page's targets.");
+    scene.lines.push("This browser cannot decode AVIF, so this page has no targets.");
     return [];
   });
   if (wanted.length) scene.picture = { width: wanted[0].naturalWidth, height: wanted[0].naturalHeight };
@@ -33,6 +33,6 @@ async function begin() {
 
 window.phasestack = {};
 window.phasestack.ready = begin().catch((error) => {
-  document.querySelector("main").textContent = `This browser can't show the page: ${error.message}`;
+  document.querySelector("main").textContent = `This browser cannot show the page: ${error.message}`;
   throw error;
 });

@@ -19,10 +19,10 @@ const CONTROLS = `
 <label>Turntable, turns per minute <input type="number" name="turntable" min="-60" max="60" step="1" value="0"></label>
 <label class="tick"><input type="checkbox" name="camera"> track the head with this browser's camera</label>
 <label hidden>Camera's horizontal field of view, degrees <input type="number" name="camera_fov_deg" min="20" max="150" step="1" value="65"></label>
-<figure class="found" hidden><svg role="img" aria-label="Camera picture with the pupils found"></svg><figcaption></figcaption></figure>
-<label class="tick"><input type="checkbox" name="held"> pause the solver: only alignment follows the head</label>
-<label class="tick"><input type="checkbox" name="lost"> lose the eyes, as if the viewer had left</label></form>
-<p class="told" role="status"></p><p><a href="/operator">the operator's page</a></p>`;
+<figure class="found" hidden><svg role="img" aria-label="Camera picture with the detected pupils"></svg><figcaption></figcaption></figure>
+<label class="tick"><input type="checkbox" name="held"> pause the solver, so that only the alignment follows the head</label>
+<label class="tick"><input type="checkbox" name="lost"> hide the viewer's eyes, as if the viewer had left</label></form>
+<p class="told" role="status"></p><p><a href="/operator">Open the operator's page</a></p>`;
 
 let look = null, socket = null, viewer = false, sensor = true, lastSent = 0, follows = null, ipd_m = 0.063, newest = null, pending = null;
 let checks = false, camera = null, lookedAt = null;
@@ -90,7 +90,7 @@ async function wish(command, value = null) {
     const answer = await (await ask("/do", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ command, value }) })).json();
     told(answer.ok ? "" : answer.error);
   } catch {
-    told("phasestack try has ended.");
+    told("phasestack try has ended. Start it again and open the address it prints.");
   }
   wishes -= 1;
   answered_ms = performance.now();
@@ -130,7 +130,7 @@ function check(on) {
   checks = on;
   for (const side of [0, 1]) look.display.target(side, null);
   main.querySelector(".light").textContent = "";
-  look.notice(on ? "Measuring a moment …" : "");
+  look.notice(on ? "Measuring the current picture …" : "");
   say({ checks });
 }
 
@@ -144,7 +144,7 @@ async function film(on) {
     camera = await navigator.mediaDevices.getUserMedia({ video: { width: { ideal: 640 }, frameRate: { ideal: 30 } } });
   } catch (error) {
     form("camera").checked = false;
-    return told(`no camera: ${error.message}`);
+    return told(`The camera cannot be used: ${error.message}`);
   }
   const mine = camera, video = Object.assign(document.createElement("video"), { srcObject: mine, muted: true, playsInline: true });
   await video.play();
@@ -178,7 +178,7 @@ function found({ url, size: [width, height], pupils_px, reason }) {
   svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
   const rings = (pupils_px ?? []).map(([cx, cy], side) => made("circle", { cx, cy, r: 6, class: `pupil ${side ? "right" : "left"}` }));
   svg.replaceChildren(made("image", { href: url, width, height }), ...rings);
-  box.querySelector("figcaption").textContent = pupils_px ? "camera picture and the pupils found" : `no viewer: ${reason}`;
+  box.querySelector("figcaption").textContent = pupils_px ? "camera picture with the detected pupils" : `no viewer: ${reason}`;
 }
 
 function painted() {
@@ -210,8 +210,8 @@ function explained({ state, reason }) {
   const late = /solutions take (\d+) ms|has not answered for (\d+) ms/.exec(reason);
   if (!late) return `${state.split(":")[0]}: ${reason}`;
   const seconds = ((late[1] ?? late[2]) / 1000).toFixed(1);
-  return `A solution takes ${late[1] ? "" : "more than "}${seconds} s on this machine. Until the next one the panels are aligned to your head. ` +
-    "To speed it up: choose the model fast, close other programs, or configure smaller panels (--config).";
+  return `A solution takes ${late[1] ? "" : "more than "}${seconds} s on this machine. Until the next solution, the panels are aligned to your head. ` +
+    "To speed this up, choose the model fast, close other programs or configure smaller panels with --config.";
 }
 
 function load(bytes) {
@@ -281,15 +281,15 @@ function figures(now, asked_ms) {
   const at = (share) => [...latencies].sort((a, b) => a - b)[Math.floor(share * (latencies.length - 1))];
   const rests = now.eyes_label === "rested", solves = now.solutions_per_s_now > 0;
   const rows = { // any row without a value is omitted
-    "this page draws": drawn.length > 1 && `${drawn.length} pictures per second`,
-    "the panels receive": now.fps_now > 0 && `${number(now.fps_now)} refreshes per second`,
-    "the solver makes": solves ? `${number(now.solutions_per_s_now)} solutions per second (${now.model})` : now.paused ? "nothing: it is paused" : rests && "nothing new while the head rests",
+    "page": drawn.length > 1 && `${drawn.length} pictures per second`,
+    "panels": now.fps_now > 0 && `${number(now.fps_now)} refreshes per second`,
+    "solver": solves ? `${number(now.solutions_per_s_now)} solutions per second (${now.model})` : now.paused ? "paused" : rests && "idle while the head rests",
     "effort": solves && now.effort && `${now.effort} (raster and steps)`,
-    "the view was drawn for a head": solves && typeof now.view_error_estimated_now_mm === "number" && `${number(now.view_error_estimated_now_mm)} mm from yours`,
-    "the newest solution is": solves && `${number(now.solution_age_now_ms, 0)} ms old`,
-    "standard deviation of the eyes": typeof now.eye_sigma_now_mm === "number" && `${number(now.eye_sigma_now_mm, 2)} mm (${now.eyes_label})`,
-    "pointer to aligned picture": latencies.length > 20 && `${number(at(0.5), 0)} ms median, 99% within ${number(at(0.99), 0)} ms`,
-    ...(now.program ? { "a program draws": now.missing?.content ?? (now.program.frame_ms > 0 && `${number(now.program.frame_ms, 0)} ms a frame`), "it connects to": now.program.address } : {}),
+    "estimated view error": solves && typeof now.view_error_estimated_now_mm === "number" && `${number(now.view_error_estimated_now_mm)} mm`,
+    "solution age": solves && `${number(now.solution_age_now_ms, 0)} ms`,
+    "uncertainty of the eyes": typeof now.eye_sigma_now_mm === "number" && `${number(now.eye_sigma_now_mm, 2)} mm (${now.eyes_label})`,
+    "delay from the pointer to the picture": latencies.length > 20 && `${number(at(0.5), 0)} ms median, 99% within ${number(at(0.99), 0)} ms`,
+    ...(now.program ? { "drawing program": now.missing?.content ?? (now.program.frame_ms > 0 && `${number(now.program.frame_ms, 0)} ms per frame`), "program's address": now.program.address } : {}),
     "light at the eyes": typeof now.light_db === "number" && `${number(now.light_db)} dB`,
   };
   main.querySelector(".figures")?.replaceChildren(...Object.entries(rows).filter(([, text]) => text).flatMap(([name, text]) =>

@@ -233,7 +233,9 @@ def check_size(context: moderngl.Context, stack: PanelStack) -> None:
     most_wide, most_high = (min(most, int(value)) for value in context.info["GL_MAX_VIEWPORT_DIMS"])
     for name, value, limit in (("width_px", stack.width_px, most_wide), ("height_px", stack.height_px, most_high)):
         if value > limit:
-            raise InputError("stack", name, f'{value}: this OpenGL driver allows {limit}; set model.backend = "cpu"')
+            raise InputError(
+                "stack", name, f'is {value}, but this OpenGL driver allows at most {limit}; set model.backend = "cpu"'
+            )
 
 
 def _mat3(matrix: F64) -> tuple[float, ...]:

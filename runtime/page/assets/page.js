@@ -40,10 +40,10 @@ const clock = (seconds) => new Date(seconds * 1000).toLocaleTimeString([], { hou
 const PLOTS = [
   ["refreshes/s", (s) => s.fps_now, 1],
   ["solutions/s", (s) => s.solutions_per_s_now, 1],
-  ["solution's age, ms", (s) => age(s.solution_age_now_ms), 1],
+  ["solution age, ms", (s) => age(s.solution_age_now_ms), 1],
   ["view error (estimated), mm", (s) => s.view_error_estimated_now_mm, 1],
   ["capture to light, ms", (s) => s.photon_now_ms, 1],
-  ["eyes' uncertainty, mm", (s) => s.eye_sigma_now_mm, 2],
+  ["uncertainty of the eyes, mm", (s) => s.eye_sigma_now_mm, 2],
   ["presenting (median), ms", (s) => s.stage_ms?.present?.p50, 2],
 ].map(([title, value, digits]) => {
   const box = html("div");
@@ -110,11 +110,11 @@ function figures(status) {
     model: `${status.model} on ${status.provider}`,
     panels: status.panels,
     "uptime": `${Math.floor(status.uptime_s / 3600)} h ${Math.floor((status.uptime_s % 3600) / 60)} min`,
-    refreshes: `${status.presented} presented, ${status.dropped} dropped, ${status.missed_blanks} blanks missed`,
+    refreshes: `${status.presented} presented, ${status.dropped} dropped, ${status.missed_blanks} missed blanks`,
     solutions: `${status.inferences}`,
     sensor: `${number(status.sensor_hz)} samples/s, ${status.stale_inputs} skipped`,
     "capture to light": status.photon_ms ? `${number(status.photon_ms.p50)} ms (p50), ${number(status.photon_ms.p99)} (p99)` : "–",
-    "solution's age": status.solution_age_ms ? `${number(age(status.solution_age_ms.p50))} ms (p50), ${number(age(status.solution_age_ms.p99))} (p99)` : "–",
+    "solution age": status.solution_age_ms ? `${number(age(status.solution_age_ms.p50))} ms (p50), ${number(age(status.solution_age_ms.p99))} (p99)` : "–",
     effort: status.effort ?? "–",
     "view error, estimated": status.view_error_estimated_mm ? `${number(status.view_error_estimated_mm.p50)} mm (p50), ${number(status.view_error_estimated_mm.p95)} (p95)` : "–",
     ...(status.view_error_mm ? { "view error": `${number(status.view_error_mm.p50)} mm (p50), ${number(status.view_error_mm.p95)} (p95)` } : {}),
@@ -147,7 +147,7 @@ function leftOut(status) {
     }));
   }
   const faults = Object.entries(status.faults ?? {}).map(([part, count]) => `${part} ${count}`).join(", ");
-  setText($("faults"), faults ? `faults since the start: ${faults}` : "no faults since the start");
+  setText($("faults"), faults ? `faults since startup: ${faults}` : "no faults since startup");
 }
 
 function entries(list, items, made) {
@@ -197,7 +197,7 @@ function pictures(answer) {
 const short = (name) => name.split("/").filter(Boolean).pop() ?? name;
 
 function playlist(told) {
-  const left = told?.left_s === null || told?.left_s === undefined ? "no limit" : `for ${number(told.left_s, 0)} s more`;
+  const left = told?.left_s === null || told?.left_s === undefined ? "no time limit" : `${number(told.left_s, 0)} s left`;
   setText($("list-told"), told ? `Playlist: ${told.index + 1} of ${told.entries.length} (${short(told.entries[told.index].scene)}), ${left}` : "");
   $("next").hidden = !told;
 }
@@ -274,8 +274,8 @@ async function lookUp(name) {
 function gone(why, hangs = false) {
   running = false;
   $("gone").hidden = false;
-  setText($("gone"), `${hangs ? "The daemon hangs." : "No daemon is running."} ${why}`);
-  setText($("state"), hangs ? "hangs" : "no daemon");
+  setText($("gone"), `${hangs ? "The daemon is not responding" : "No daemon is running"}: ${why}`);
+  setText($("state"), hangs ? "not responding" : "no daemon");
   $("state").dataset.state = "gone";
   document.body.dataset.known = "last";
   setText($("reason"), "");
@@ -293,11 +293,11 @@ function show(status) {
   document.body.dataset.known = "now";
   const hangs = status.turn_age_s > 5;
   $("gone").hidden = !hangs;
-  if (hangs) setText($("gone"), `the display loop has hung for ${number(status.turn_age_s, 0)} s`);
+  if (hangs) setText($("gone"), `The display loop has not responded for ${number(status.turn_age_s, 0)} s. See the log: journalctl -u phasestack`);
   const reason = status.reason ?? "", late = /solutions take|has not answered for/.test(reason);
-  setText($("state"), hangs ? "hangs" : late ? "late" : status.state ?? "starting");
+  setText($("state"), hangs ? "not responding" : late ? "late" : status.state ?? "starting");
   $("state").dataset.state = hangs ? "gone" : late ? "holding" : (status.state ?? "starting").split(":")[0];
-  setText($("reason"), late ? `${reason}: use the model "fast" or fewer pixels (the panels still follow the eyes)` : reason);
+  setText($("reason"), late ? `${reason}; use the model fast or panels with fewer pixels (the panels still follow the eyes)` : reason);
   if (status.state === undefined) return; // no refresh yet
   document.querySelector('[data-command="pause"]').setAttribute("aria-pressed", String(status.paused));
   document.querySelector('[data-command="flat"]').setAttribute("aria-pressed", String(status.flat_asked));
@@ -320,7 +320,7 @@ async function every(ms, work) {
     try {
       await work();
     } catch {
-      gone("The page's server does not answer either. It has stopped, or the network is down.");
+      gone("the server of this page does not answer; it has stopped, or the network is down");
       pause = RETRY_MS;
     }
     await new Promise((done) => setTimeout(done, pause));
@@ -377,7 +377,7 @@ async function tell(button, command, value = null, where = $("told")) {
     setText(where, said.ok ? `${command}: done${said.file ? `: ${said.file}` : said.note ? `: ${said.note}` : ""}` : `${command}: ${said.error}`);
   } catch {
     where.dataset.kind = "bad";
-    setText(where, `${command}: the page's server does not answer`);
+    setText(where, `${command}: the server of this page does not answer`);
   } finally {
     if (button) {
       button.disabled = false;

@@ -86,7 +86,7 @@ def settle(trial: Trial, *, limit: float | None = None) -> Case:
     if trial.expected == "refuses":
         answer = replace(answer, note="it returned an answer although none exists")
     elif trial.floor is not None and limit is None:
-        answer = replace(answer, tolerance=-1.0, note="no limit is recorded; run phasestack stability --record")
+        answer = replace(answer, tolerance=-1.0, note="no limit is recorded; run `phasestack stability --record`")
     elif trial.floor is not None and limit is not None:
         answer = replace(answer, tolerance=min(answer.tolerance, WORSE * limit + trial.floor))
     backward = answer.forward_error if answer.backward_error is None else answer.backward_error
