@@ -34,6 +34,7 @@ ROWS_SHARE = 1.75
 CELLS_MAX = 1024
 # Maximum column width, in panel columns / `reduction`. 1.2 would lose up to 0.25 dB, and 0.4 would gain nothing.
 WIDEST = 0.8
+LEAST_CELL_PX = 2  # with one column per parallax, eyes near small panels would see 8 % more error
 BLOCK_ROWS = 8  # rows that the network transforms together; the number of rows is always a multiple of this
 ROWS_MAX = 1 << 15  # eye positions are implausible if they would need more rows than this at full height
 NEAREST_F = 0.8  # maximum ratio of the raster's half width to the distance from its middle to F
@@ -153,7 +154,7 @@ def chain_frame(eyes_m: F64, stack: PanelStack, *, most_cell_px: int, reduction:
     per_parallax = (stack.x_m[-1] - plane_m) / (middle_m[0] - stack.x_m[-1]) / ahead_m
     parallax_m = abs(line.from_f_m2[0] * per_parallax)  # at the window's middle
     widest_m = WIDEST * reduction * stack.width_m / stack.width_px
-    cell_px = min(max(ceil(parallax_m / widest_m), 1), most_cell_px)
+    cell_px = min(max(ceil(parallax_m / widest_m), LEAST_CELL_PX), most_cell_px)
     per_column, column_m = per_parallax / cell_px, parallax_m / cell_px
     if column_m < 1e-12:
         raise ValueError("the eyes have no horizontal separation as seen from the display")
