@@ -27,7 +27,7 @@ EXTRA_BYTES = 60 << 10  # how much larger a page may be than its layers as PNG f
 PAGE_BYTES = 8_000_000  # maximum size of a page
 LAYERS_BYTES = 6_400_000  # maximum size of lossless layers in a page; larger ones (4K) are compressed lossily
 QUALITY_BYTES = 512  # space reserved for the lines that state how good the compressed pictures are
-QUALITIES = (92, 84, 76, 66, 54)  # AVIF qualities, tried in this order until the pictures fit
+QUALITIES = (92, 84, 76, 70, 65, 60, 54)  # AVIF qualities, tried in this order until the pictures fit
 CODINGS: dict[str, dict[str, Any]] = {
     "png": {},
     "webp": {"lossless": True, "method": 2, "quality": 20},
