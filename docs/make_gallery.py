@@ -120,7 +120,7 @@ def page(report: dict[str, Any]) -> str:
         [
             HEAD,
             "## Error against run time\n",
-            f"`{report['command']}` measured these figures on built-in scenes with {size} panels ({facts}). "
+            f"These figures for built-in scenes with {size} panels come from `{report['command']}` ({facts}). "
             "SART-n is `sart` after n iterations.\n",
             _table(HEADINGS, rows),
             "![light against run time](images/frontier.png)\n",
