@@ -61,17 +61,17 @@ PICTURES = {  # name in docs/images: path in the work folder
 }
 MOVING = f"""\
 The daemon's own loop ran for {SECONDS:g} s on the simulated clock, with 960x540 panels and {NOISE_MM} mm of sensor
-noise. The simulated costs are those of a slow processor (in ms on the full raster: render 44, prepare
-40, inference 31, finish 38, each step 85). In the row *film*, the content moves and the head rests.
+noise. The simulated costs match a slow processor (in ms on the full raster: render 44, prepare 40,
+inference 31, finish 38, each step 85). In the row *film*, the content moves while the head rests.
 
-An [effort](mathematics.md#effort) is a raster and a number of steps; `1/2+0` means half the raster
-without steps. *Full* runs the whole model for every solution. *Auto*, the default, chooses an effort
-for each solution. The table gives [live quality](contracts.md#error) in dB, the view error in mm
-(median and 95th percentile) and each effort's share of the time. Between solutions, the picture is
-[reprojected](mathematics.md#reprojection) by its depth.
+An [effort](mathematics.md#effort) combines a raster with a number of steps: `1/2+0` means half the
+raster and no steps. *Full* runs the whole model for every solution. *Auto*, the default, chooses an
+effort for each solution. The table gives [live quality](contracts.md#error) in dB, the view error in
+mm (median and 95th percentile) and each effort's share of the time. Between solutions, the picture is
+[reprojected](mathematics.md#reprojection) according to its depth.
 """
 LEANING = """\
-The film shows every fourth refresh: with `model.effort = "full"` ("before"), with `"auto"` ("now"), and the true view.
+The film shows every fourth refresh with `model.effort = "full"` ("before") and `"auto"` ("now"), and the true view.
 """
 HEAD = """\
 <!-- Written by `make gallery`: change docs/make_gallery.py, not this page. -->
@@ -83,12 +83,12 @@ HEAD = """\
     phasestack bench --out new.json           # figures for regression tests
     phasestack bench compare old.json new.json
 
-**Quote [light](contracts.md#error) at a tracking error of 1 mm** (`light_db`, `"1"`). *One ray* is `psnr_db`. The time
-of a solution runs from two decoded pictures to 8-bit layers. Memory is the peak of the method's own process.
-Compare ratios.
+**Quote [light](contracts.md#error) at a tracking error of 1 mm** (`light_db`, `"1"`). *One ray* is `psnr_db`. The
+solution time runs from two decoded pictures to 8-bit layers. Memory is the peak memory of the method's own process.
+Compare ratios, not absolute times.
 
-`report --pairs` reads every [case file](contracts.md#cases-pairs-calibration) in DIR. Its optional field `off`
-lists pictures that should be seen from a point `mm` away from an eye:
+`report --pairs` reads every [case file](contracts.md#cases-pairs-calibration) in DIR. The optional field `off`
+lists pictures that should be seen from a point `mm` millimetres away from an eye:
 
     {"panels": {"width_m": 0.5184, "height_m": 0.2916, "x_m": [-0.06, 0.0, 0.06]},
      "eyes": [[0.78, -0.03, 0.24], [0.78, 0.03, 0.24]], "images": ["left.png", "right.png"], "fov": 40.0,
@@ -120,7 +120,7 @@ def page(report: dict[str, Any]) -> str:
         [
             HEAD,
             "## Error against run time\n",
-            f"`{report['command']}` measured these figures on built-in scenes with {size} panels ({facts}). "
+            f"These figures for built-in scenes with {size} panels come from `{report['command']}` ({facts}). "
             "SART-n is `sart` after n iterations.\n",
             _table(HEADINGS, rows),
             "![light against run time](images/frontier.png)\n",
@@ -130,8 +130,8 @@ def page(report: dict[str, Any]) -> str:
             "![a leaning head, before, now, and what it should see](images/leaning.webp)\n",
             LEANING,
             "## Focal parallax\n",
-            "Three cards are seen through a pupil of 4 mm. The table gives the distance of each card, and the "
-            "distances at which its\npicture through the layers and the card itself look sharpest.\n",
+            "Three cards are seen through a 4 mm pupil. For each card, the table gives its distance, and the "
+            "distances of sharpest\nfocus for its picture through the layers and for the card itself.\n",
             _table(["card, mm", "sharpest through the layers, mm", "sharpest without the display, mm"], cards),
             "![focused behind, on and in front of the panels](images/focal-slices.jpg)",
             "",
