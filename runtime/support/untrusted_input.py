@@ -64,6 +64,29 @@ def checked_path(path: str | Path, *, source: str | Path = "", field: str = "") 
     return Path(path)
 
 
+def path_within_folder(path: str, *, source: str | Path, field: str) -> Path:
+    """Check that a relative path does not leave its folder, and return the normalized path, which need not exist.
+
+    Symbolic links are not resolved: what is in the folder is the choice of its owner.
+
+    Args:
+        path: Path in an untrusted file, relative to the folder of that file.
+        source: File to name in messages.
+        field: Field to name in messages.
+
+    Raises:
+        InputError: The path is invalid, absolute, or leads out of the folder.
+    """
+    name = Path(os.path.normpath(checked_path(path, source=source, field=field)))
+    if name.is_absolute():
+        problem = "is an absolute path"
+    elif name.parts[:1] == (os.pardir,):
+        problem = "is outside the folder of this file"
+    else:
+        return name
+    raise InputError(source, field, f"{shown(path, most=200)} {problem}; only files in that folder and below are read")
+
+
 def is_there(path: str | Path, *, folder: bool = False) -> bool:
     """Return True if a path exists.
 
