@@ -13,7 +13,7 @@ from runtime.errors import Stopped
 from runtime.eyes.calibration import Calibration
 from runtime.model.predictor import Predictor
 
-LEFT_BEHIND = "content or model took too long to load, so the solver was restarted; nothing has changed"
+SOLVER_ABANDONED = "content or model took too long to load, so the solver was restarted; nothing has changed"
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +73,7 @@ class RunCell:
         """
         with self._lock:
             if generation not in (None, self.generation):
-                raise Stopped(LEFT_BEHIND)
+                raise Stopped(SOLVER_ABANDONED)
             before = self.state
             self.state = replace(before, version=before.version + 1, **changes)
             return before
