@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import grp
 import os
 import socket
@@ -249,6 +250,20 @@ def test_an_asker_that_only_sends_no_more_is_still_there(server: StatusServer, p
         assert waiting.take()
         waiting.done(flat=True)
         assert b'"flat": true' in client.recv(1000)
+
+
+def test_a_folder_that_stays_locked_is_used_and_a_line_says_so(
+    path: Path, clock: SimulatedClock, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("runtime.daemon.socket_file.LOCKED_WITHIN_S", 0.05)
+    path.parent.mkdir()
+    other = os.open(path.parent, os.O_RDONLY)
+    fcntl.flock(other, fcntl.LOCK_EX)
+    made = StatusServer(path, clock=clock)
+    assert status(path)["ok"]
+    made.close()
+    os.close(other)
+    assert f"{path.parent} is locked by another program" in caplog.text
 
 
 TAKES_IT = """
