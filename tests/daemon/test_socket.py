@@ -162,6 +162,18 @@ def test_without_a_daemon_the_client_says_what_to_do(path: Path) -> None:
         status(path)
 
 
+def test_an_answer_that_is_no_object_is_of_no_daemon(path: Path) -> None:
+    path.parent.mkdir()
+    with socket.socket(socket.AF_UNIX) as other, ThreadPoolExecutor() as pool:
+        other.bind(str(path))
+        other.listen()
+        asked = pool.submit(status, path)
+        with other.accept()[0] as client:
+            client.sendall(b"[1]\n")
+            with pytest.raises(NotRunning, match="the answer is not a JSON object"):
+                asked.result(timeout=20)
+
+
 def connected(path: Path) -> socket.socket:
     client = socket.socket(socket.AF_UNIX)
     client.settimeout(20)
