@@ -65,9 +65,9 @@ def checked_path(path: str | Path, *, source: str | Path = "", field: str = "") 
 
 
 def path_within_folder(path: str, *, source: str | Path, field: str) -> Path:
-    """Check that a relative path does not leave its folder, and return the normalized path, which need not exist.
+    """Check that a relative path does not leave its folder, and return the normalized path.
 
-    Symbolic links are not resolved: what is in the folder is the choice of its owner.
+    The path need not exist. Symbolic links are not resolved, because the owner of the folder has put them there.
 
     Args:
         path: Path in an untrusted file, relative to the folder of that file.
