@@ -26,7 +26,7 @@ from runtime.config import Settings
 from runtime.errors import InputError
 from runtime.optics.stack import UNEVEN_MOST, PanelStack, Tilt
 from runtime.records import F64, U8
-from runtime.support.artifacts import write_json
+from runtime.support.artifacts import OutputFolder, write_json
 from runtime.support.progress import status_line
 
 MIN_PHOTOGRAPHS = 5  # minimum number of usable photographs
@@ -205,8 +205,8 @@ def register_photos(
         A summary of the run, for the command to report.
 
     Raises:
-        InputError: The photographs do not determine the panels' poses, or `config` describes a different number of
-            panels. Nothing is written.
+        InputError: The photographs do not determine the panels' poses, `config` describes a different number of panels
+            or cannot be updated, or `out` cannot be written to. `registration.json` is then not written.
     """
     stack = settings.stack.stack()
     if config is not None and len(settings.output.panels) not in (0, stack.count):
@@ -223,10 +223,11 @@ def register_photos(
     except Undetermined as problem:
         raise InputError(source, "photographs", str(problem)) from None
     summary = registration_summary(registered) | {"source": source}
-    write_json(out / "registration.json", summary)
-    if config is not None:
-        kept = rewrite(config, lambda document: put_registration(document, registered))
-        summary["kept_version"] = str(kept) if kept else None
+    with OutputFolder(out) as folder:
+        write_json(folder.staging / "registration.json", summary)
+        if config is not None:
+            kept = rewrite(config, lambda document: put_registration(document, registered))
+            summary["kept_version"] = str(kept) if kept else None
     return summary
 
 

@@ -31,8 +31,10 @@ class StoredPairs(Lenient):
     @model_validator(mode="after")
     def _fit_together(self) -> StoredPairs:
         sizes = {len(column) for column in (self.sensor_m, self.stack_m, self.used, self.names)}
-        if len(sizes) > 1 or not any(self.used):
+        if len(sizes) > 1:
             raise ValueError("names, used, sensor_m and stack_m differ in length")
+        if not any(self.used):
+            raise ValueError("used is true for no pair, but a calibration is computed from pairs")
         return self
 
 

@@ -27,14 +27,9 @@ LEFT, RIGHT, INK, SOFT = "#1f6fb4", "#d1661b", "#222222", "#8a8f98"
 FOV_DEG = 40.0
 
 
-def arrow(
-    axes: Any, start: tuple[float, float], end: tuple[float, float], colour: str = INK, bend: float = 0.0
-) -> None:
+def arrow(axes: Any, start: tuple[float, float], end: tuple[float, float]) -> None:
     """Draw an arrow between two points in data coordinates."""
-    style = f"arc3,rad={bend}"
-    axes.add_patch(
-        FancyArrowPatch(start, end, arrowstyle="-|>", mutation_scale=12, lw=1.4, color=INK, connectionstyle=style)
-    )
+    axes.add_patch(FancyArrowPatch(start, end, arrowstyle="-|>", mutation_scale=12, lw=1.4, color=INK))
 
 
 def box(axes: Any, x: float, y: float, width: float, height: float, text: str, colour: str) -> None:

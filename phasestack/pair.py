@@ -348,7 +348,8 @@ def camera(eye_m: Sequence[float] | F64, *, width_px: int, height_px: int, fov_d
     """
     sizes = {"width_px": width_px, "height_px": height_px}
     for name, size in sizes.items():
-        _number(name, size, 1, 1 << 16, "pixels")
+        if not _number(name, size, 1, 1 << 16, "pixels").is_integer():
+            raise ValueError(f"{name}: is {size!r}, not a whole number of pixels")
     eye = np.asarray(eye_m, np.float64)
     if eye.shape != (3,) or not np.isfinite(eye).all() or not eye.any():
         raise ValueError("eye_m: must be three finite numbers in metres that are not all 0")

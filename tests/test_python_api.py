@@ -230,6 +230,12 @@ def test_cameras_that_look_at_the_middle_are_what_is_meant_without_them() -> Non
     assert np.allclose(pixels[0], (160, 90)) and pixels[1, 0] > 160 > 0 and np.isnan(pixels[2]).all()
 
 
+@pytest.mark.parametrize("given", [{"width_px": 1.5}, {"height_px": 0}, {"height_px": float("nan")}])
+def test_a_camera_s_size_is_whole_pixels(given: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=next(iter(given))):
+        phasestack.camera(EYES[0], **{"width_px": 320, "height_px": 180, **given})
+
+
 def test_anybody_s_layers_are_evaluated_as_ours_are() -> None:
     result = phasestack.solve(picture(), picture(3), eyes_m=EYES, stack=STACK, model="fast")
     how: dict[str, Any] = {"eyes_m": EYES, "stack": STACK}

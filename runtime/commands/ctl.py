@@ -94,7 +94,8 @@ PLAIN = {
     "flat": "Show the flat (2D) picture until `resume`.",
     "reload": "Reload the configuration file. If it is invalid, the old configuration stays in use.\n\n"
     "A scene, model or placement set by `ctl` stays unless the file has changed that setting.",
-    "blackbox": "Save the last two minutes of eyes, states, times and log lines to an MCAP file and print its name.",
+    "blackbox": "Save the last minutes of eyes, states, times and log lines to an MCAP file and print its name.\n\n"
+    "The setting `service.blackbox_minutes` is the number of minutes.",
 }  # commands that take no argument
 
 

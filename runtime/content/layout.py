@@ -16,7 +16,7 @@ import numpy as np
 from runtime.config import ContentSettings
 from runtime.content.panorama import ahead, is_around
 from runtime.errors import InputError
-from runtime.records import U8
+from runtime.records import F32, U8
 
 QUILT = re.compile(r"(?<![a-z0-9])qs([0-9]{1,6})x([0-9]{1,6})(?:a([0-9]*\.?[0-9]+))?(?![0-9])")
 ASPECT_MIN, ASPECT_MAX = 0.05, 20.0  # width over height of one view
@@ -192,7 +192,7 @@ def hint(picture: U8) -> str:
     return ""
 
 
-def _detail(view: U8) -> U8:
+def _detail(view: U8) -> F32:
     """Reduce a view to a small grey picture for comparison.
 
     The picture is high-pass filtered, because smooth areas such as skies always look alike.

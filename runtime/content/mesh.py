@@ -116,8 +116,8 @@ def load_mesh(path: Path) -> MeshData:
 def folder_reader(path: Path, field: str) -> Callable[[str], bytes]:
     """Return a function that reads the files a mesh refers to by URI or path.
 
-    The function keeps the contents of each file in memory. It raises InputError if a reference is not a relative path,
-    or if the file cannot be read.
+    The function keeps the contents of each file in memory. It raises InputError if a reference is not a relative path
+    to a file in the folder of the mesh or below, or if the file cannot be read.
 
     Args:
         path: Mesh file.
@@ -137,14 +137,13 @@ def folder_reader(path: Path, field: str) -> Callable[[str], bytes]:
 def _file_of(uri: str, *, source: Path, field: str) -> Path:
     """Return the path of the file that a URI or relative path in the file `source` refers to.
 
-    Raises InputError if the URI has a scheme, the path is absolute, or the file does not exist.
+    Raises InputError if the URI has a scheme, the path is absolute or leads out of the source's folder, or the file
+    does not exist.
     """
     shown = untrusted_input.shown(uri, most=200)
     if "://" in uri or uri.startswith("data:"):
-        raise InputError(source, field, f"{shown} is not a file next to this one; only such files are read")
-    name = untrusted_input.checked_path(unquote(uri), source=source, field=field)
-    if name.is_absolute():
-        raise InputError(source, field, f"{shown} is an absolute path; only files next to this one are read")
+        raise InputError(source, field, f"{shown} is not a path; only files in this file's folder or below it are read")
+    name = untrusted_input.path_within_folder(unquote(uri), source=source, field=field)
     if not (source.parent / name).exists():
         raise InputError(source, field, f"{shown} does not exist")
     return source.parent / name

@@ -70,15 +70,15 @@ class FolderResolver(trimesh.resolvers.FilePathResolver):
     def _named(self, name: str) -> str | None:
         """Return the name of an existing file in the mesh's folder, or None if no file matches.
 
-        The given name may contain MTL options, a Windows path, or letters in the wrong case. Absolute paths are
-        returned unchanged.
+        The given name may contain MTL options, a Windows path, or letters in the wrong case. Raises
+        InputError if the name is an absolute path or leads out of the folder.
         """
         name = DRIVE.sub("", OPTIONS.sub("", name, count=1).strip().replace("\\", "/"))
-        untrusted_input.checked_path(name, source=self._path, field="texture")
-        if Path(name).is_absolute() or (self._path.parent / name).exists():
-            return name
+        within = untrusted_input.path_within_folder(name, source=self._path, field="texture")
+        if (self._path.parent / within).exists():
+            return str(within)
         folder = self._path.parent
-        for step in Path(name).parts:
+        for step in within.parts:
             alike = {other.name.lower(): other for other in folder.iterdir()} if folder.is_dir() else {}
             folder = alike.get(step.lower(), folder / step)
         return str(folder.relative_to(self._path.parent)) if folder.exists() else None

@@ -82,7 +82,10 @@ def ask(paths: Iterable[Path], request: dict[str, Any], *, timeout_s: float = 10
 
 
 def _exchanged(path: Path, request: dict[str, Any], timeout_s: float) -> dict[str, Any]:
-    """Send a request as one JSON line and return the decoded answer."""
+    """Send a request as one JSON line and return the decoded answer.
+
+    Raises OSError if the connection fails, and ValueError if the answer is not a JSON object.
+    """
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as channel:
         channel.settimeout(timeout_s)
         channel.connect(str(path))
@@ -94,7 +97,9 @@ def _exchanged(path: Path, request: dict[str, Any], timeout_s: float) -> dict[st
             line = answers.readline()
     if not line:
         raise ConnectionResetError("the daemon closed the connection without an answer")
-    answer: dict[str, Any] = json.loads(line)
+    answer = json.loads(line)
+    if not isinstance(answer, dict):
+        raise ValueError("the answer is not a JSON object")
     return answer
 
 

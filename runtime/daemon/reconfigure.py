@@ -15,7 +15,7 @@ from runtime.daemon.commands import PLACING
 from runtime.daemon.solver_parts import RunningSolver, ready_predictor
 from runtime.errors import PhasestackError, Stopped
 from runtime.eyes.calibration import Calibration, load_calibration
-from runtime.frame.run_state import LEFT_BEHIND
+from runtime.frame.run_state import SOLVER_ABANDONED
 from runtime.model.predictor import SHIPPED, Predictor
 from runtime.optics.stack import PanelStack
 from runtime.support.background import BackgroundJob
@@ -92,7 +92,7 @@ class Reconfiguration:
         Also True if the solver has been replaced while adopting it, or if it was abandoned but takes too long to load.
         """
         if not self._finished and self._adopter is not None and not self._adopter.is_newest:
-            self.problem, self._finished = LEFT_BEHIND, True
+            self.problem, self._finished = SOLVER_ABANDONED, True
         is_stuck = self.abandoned and time.monotonic() - self._begun_s > LIMITS.load_s
         return self._finished or is_stuck
 

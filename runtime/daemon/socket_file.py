@@ -65,7 +65,7 @@ def listening_socket(path: Path) -> socket.socket:
 def _locked(folder: Path) -> Iterator[None]:
     """Lock a folder, so that no two daemons replace a dead socket at the same time.
 
-    If the lock is not available within `LOCKED_WITHIN_S`, continue without it.
+    If the lock is not available within `LOCKED_WITHIN_S`, log a warning and continue without it.
     """
     opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
@@ -75,6 +75,8 @@ def _locked(folder: Path) -> Iterator[None]:
                 fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 break
             time.sleep(0.01)
+        else:
+            log.warning("%s is locked by another program; the status socket is created without the lock", folder)
         yield
     finally:
         os.close(opened)

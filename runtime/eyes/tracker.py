@@ -28,8 +28,7 @@ FIRST_SPEED = 0.3  # standard deviation of a newly found head's velocity, in m/s
 REACH_SPEED, REACH_ACCELERATION = 2.0, 30.0  # limits of a head's motion in m/s and m/s²
 KEEP_S = 0.4  # after a longer gap between samples, a head's motion estimate is discarded
 ANOTHER_AFTER_S = 0.5  # a viewer unseen for this long, or for hold_s if that is shorter, is replaced by another person
-LOSS_S = 0.2  # after this long without a sample, eyes are held rather than predicted
-HORIZON_S = 0.2  # longest prediction
+HORIZON_S = 0.2  # longest prediction; after this time without a sample, eyes are held
 DECAY_S = 0.06  # time constant for slowing a lost head's predicted motion to rest
 REVIVE_S = 0.06  # length of the blend when lost eyes are found again
 CLOCK_RESET_NS = NS_PER_S  # if a capture time is this far in the past, the clock was set back
@@ -219,7 +218,7 @@ class Tracker:
             return ""
         last = self._history[-1]
         age_s = last.head.age_s(sample.capture_ns)
-        is_held = self._lost_ns is not None or age_s > LOSS_S
+        is_held = self._lost_ns is not None or age_s > HORIZON_S
         known = self._other
         again = sample.continued(known.head) if known is not None else None
         if head := sample.continued(last.head):
@@ -283,7 +282,7 @@ class Tracker:
 
         * `exact` at the time of a sample,
         * `interpolated` between two samples,
-        * `predicted` up to `LOSS_S` after the newest sample,
+        * `predicted` up to `HORIZON_S` after the newest sample,
         * `held` once the face is lost and the predicted eyes slow to rest,
         * `none` if the eyes were never seen, were lost for longer than `hold_s` or were forgotten.
 
@@ -300,7 +299,7 @@ class Tracker:
         if age_s > self.settings.hold_s:
             return EyesEstimate(time_ns, capture_ns, None, "none")
         self._asked_ns = max(self._asked_ns, time_ns)
-        label: EyesLabel = "held" if self._lost_ns is not None or age_s > LOSS_S else "predicted"
+        label: EyesLabel = "held" if self._lost_ns is not None or age_s > HORIZON_S else "predicted"
         ahead_s = min(age_s, HORIZON_S)
         if self._lost_ns is not None:
             known_s = min(newest.head.age_s(self._lost_ns), ahead_s)

@@ -40,6 +40,9 @@ class Aim:
         self._chooser = EffortChooser()
         self._calm_ns: int | None = None  # when the head's speed fell below CALM_M_S
         self._expected: dict[int, float] = {}  # expected squared distance to the true eyes, m², by requested time
+        # Effort chosen when the head was last seen. A lost head keeps it, because the error at an unknown position favours
+        # long solutions, and the solver would still be busy when the head returns.
+        self._seen_effort: Effort | None = None
         self._speed2 = 0.0  # running mean of the squared speed, in (m/s)²
         self._learned: int | None = None  # number of the latest solution whose measures have been used
 
@@ -67,16 +70,18 @@ class Aim:
         predictor, refined, costs = state.predictor, None, self._solver.costs
         whole = self._fixed or Effort(1, predictor.steps)
         effort, expected_m2 = whole, 0.0
-        if eyes.eyes_m is not None and state.settings.model.effort == "auto":
+        timed = tuple(by for by in predictor.reductions if by in costs.stages)  # a new model may lack timings
+        if timed and eyes.eyes_m is not None and state.settings.model.effort == "auto":
             outlook = self._outlook(timing, eyes)
             horizon_s = self._horizon_s(timing, speed_m_s=outlook(0.0).speed_m_s)
             error = self._shown_error(eyes, shown, time_ns=timing.photon_ns)
             period_ms = self._period_ns / NS_PER_MS
-            timed = tuple(by for by in predictor.reductions if by in costs.stages)  # a new model may lack timings
-            effort = self._chooser.choose(
-                candidates(timed, predictor.steps),
-                costs, outlook, shown_error=error, period_ms=period_ms, horizon_s=horizon_s,
-            )  # fmt: skip
+            if eyes.label != "held" or self._seen_effort is None or self._seen_effort.reduction not in timed:
+                self._seen_effort = self._chooser.choose(
+                    candidates(timed, predictor.steps),
+                    costs, outlook, shown_error=error, period_ms=period_ms, horizon_s=horizon_s,
+                )  # fmt: skip
+            effort = self._seen_effort
             if shown is not None and eyes.label == "rested":
                 most = predictor.refined_steps
                 refined = self._refined(shown, most, costs, shown_error=error, horizon_s=horizon_s)
@@ -127,8 +132,11 @@ class Aim:
     def _outlook(self, timing: FrameTiming, eyes: EyesEstimate) -> Callable[[float], Outlook]:
         near = self._viewer.ahead(timing.photon_ns + self._period_ns)
         far = self._viewer.ahead(timing.photon_ns + HORIZON_NS)
-        if near.eyes_m is None or far.eyes_m is None or eyes.eyes_m is None or far.label == "rested":
+        if far.label == "rested":
             return lambda cost_ms: Outlook()
+        if eyes.eyes_m is None or near.eyes_m is None or far.eyes_m is None:  # a lost head, soon given up
+            lost = Outlook(eyes.sigma_m, self._speed2**0.5)
+            return lambda cost_ms: lost
         speed_m_s = self._usual_speed_m_s(float(np.linalg.norm((near.eyes_m - eyes.eyes_m).mean(axis=0))), eyes)
 
         growth_m = max(far.sigma_m - near.sigma_m, 0.0) / (HORIZON_NS - self._period_ns)

@@ -57,7 +57,7 @@ class Costs:
 
     def ms(self, effort: Effort) -> float:
         """Return how long a solution takes from start to complete layers, in milliseconds."""
-        stages = self.stages[effort.reduction]
+        stages = self.stages.get(effort.reduction, {})
         steps = effort.steps - (effort.continued_from or 0)
         begun = ("finish",) if effort.continued_from is not None else ("render", "prepare", "inference", "finish")
         return sum(stages.get(stage, 0.0) for stage in begun) + steps * stages.get("step", 0.0)

@@ -13,7 +13,7 @@ from runtime.errors import Stopped
 from runtime.eyes.calibration import Calibration
 from runtime.model.predictor import Predictor
 
-LEFT_BEHIND = "the scene or the model took too long to load, so the solver was restarted with the old settings"
+SOLVER_ABANDONED = "the scene or the model took too long to load, so the solver was restarted with the old settings"
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +73,7 @@ class RunCell:
         """
         with self._lock:
             if generation not in (None, self.generation):
-                raise Stopped(LEFT_BEHIND)
+                raise Stopped(SOLVER_ABANDONED)
             before = self.state
             self.state = replace(before, version=before.version + 1, **changes)
             return before

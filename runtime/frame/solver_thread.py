@@ -6,7 +6,7 @@ import logging
 import math
 import queue
 import threading
-from collections import defaultdict, deque
+from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
@@ -102,7 +102,7 @@ class SolverThread(SolverHost):
 
     @property
     def costs(self) -> Costs:
-        return self._costs or Costs(defaultdict(dict))  # no costs are known if a run is stopped during startup
+        return self._costs or Costs({})  # no costs are known if a run is stopped during startup
 
     def post(self, request: SolveRequest) -> None:
         with self._lock:

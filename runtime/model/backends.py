@@ -78,19 +78,27 @@ def _faster(predictor: Predictor, made: Callable[[], GlBackend]) -> Choice:
     cpu = _cpu()
     try:
         gl = made()
+    except PhasestackError as error:
+        return Choice(cpu, f"OpenGL is not available: {error}")
+    used = cpu
+    try:
         for share, runs in ((FIRST_SHARE, RUNS), (1, 1)):
             width_px, height_px = (max(64, px // share) for px in (predictor.stack.width_px, predictor.stack.height_px))
             stack = replace(predictor.stack, width_px=width_px, height_px=height_px)
-            cpu_ms, gl_ms = (solution_ms(predictor, stack, backend, runs=runs) for backend in (cpu, gl))
+            times_ms = []
+            for used in (cpu, gl):
+                times_ms.append(solution_ms(predictor, stack, used, runs=runs))
+            cpu_ms, gl_ms = times_ms
             times = f"{stack.width_px}x{stack.height_px}: cpu {cpu_ms:.1f} ms, gl {gl_ms:.1f} ms"
             if max(cpu_ms, gl_ms) > CLEAR * min(cpu_ms, gl_ms):
                 break
         if gl_ms < cpu_ms:
             return Choice(gl, f"the faster at {times}")
+        why = f"the faster at {times}"
     except PhasestackError as error:
-        return Choice(cpu, f"OpenGL is not available: {error}")
+        why = f"a solution on {used.name} failed: {error}"
     gl.close()
-    return Choice(cpu, f"the faster at {times}")
+    return Choice(cpu, why)
 
 
 def solution_ms(predictor: Predictor, stack: PanelStack, backend: SolverBackend, *, runs: int) -> float:

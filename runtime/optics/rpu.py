@@ -22,15 +22,17 @@ def panel_from_image(image_from_stack: F64, raster: PlaneRaster) -> F64:
         image_from_stack: (3, 4) projection from frame `stack` to the eye's image.
 
     Raises:
-        ValueError: The eye is in the panel's plane.
+        ValueError: The eye is in the panel's plane, or the projection is not finite.
     """
     h = image_from_raster(image_from_stack, raster)
     adjugate = np.array([np.cross(h[:, 1], h[:, 2]), np.cross(h[:, 2], h[:, 0]), np.cross(h[:, 0], h[:, 1])])
     scale = np.abs(adjugate).max()
+    if not np.isfinite(scale):
+        raise ValueError("the projection from the panel to the eye's image is not finite")
     # A determinant below `noise` may be nothing more than rounding error from the sum in the last column of h.
     terms = np.abs(image_from_stack) @ np.abs([raster.x_m, raster.left_m, raster.top_m, 1.0])
     noise = 64 * np.finfo(np.float64).eps * float(terms @ np.abs(adjugate[2]))
-    if not np.isfinite(scale) or scale == 0.0 or abs(adjugate[2] @ h[:, 2]) <= noise:
+    if scale == 0.0 or abs(adjugate[2] @ h[:, 2]) <= noise:
         raise ValueError("the eye is in the panel's plane, so its view of the panel is singular")
     result: F64 = adjugate / scale
     return result

@@ -17,18 +17,23 @@ CONNECTIONS_MAX = 64  # maximum number of simultaneous connections
 
 
 class LimitedConnection(H11Protocol):
-    """HTTP connection that is closed if it is still waiting for a request `REQUEST_S` after opening.
+    """HTTP connection that is closed if it is still waiting longer than `REQUEST_S` for a request.
 
-    If there are more than `CONNECTIONS_MAX` connections, the oldest one that is waiting for a request is closed.
+    The wait begins when the connection is opened, and again after each answer. If there are more than `CONNECTIONS_MAX`
+    connections, the one that has waited longest is closed.
     """
 
     def connection_made(self, transport: Any) -> None:
         super().connection_made(transport)
-        self.made_s = self.loop.time()
-        self._timer: asyncio.TimerHandle = self.loop.call_later(REQUEST_S, self._let_go)
+        self._begin_wait()
         if len(self.connections) > CONNECTIONS_MAX:
             waiting = [one for one in self.connections if isinstance(one, LimitedConnection) and one.waits]
-            min(waiting, key=lambda one: one.made_s).transport.abort()  # perhaps this one
+            min(waiting, key=lambda one: one.waits_since_s).transport.abort()  # perhaps this one
+
+    def on_response_complete(self) -> None:
+        super().on_response_complete()
+        self._timer.cancel()
+        self._begin_wait()
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._timer.cancel()
@@ -39,6 +44,10 @@ class LimitedConnection(H11Protocol):
         """True if the connection is waiting for a request."""
         cycle: Any = self.cycle  # None before the first request
         return cycle is None or bool(cycle.response_complete)
+
+    def _begin_wait(self) -> None:
+        self.waits_since_s = self.loop.time()
+        self._timer: asyncio.TimerHandle = self.loop.call_later(REQUEST_S, self._let_go)
 
     def _let_go(self) -> None:
         if self.waits and self in self.connections:  # not if it has been upgraded to another protocol

@@ -108,13 +108,10 @@ def mounting_of(arrow: Arrow, *, mirrored: bool) -> tuple[int, str]:
     Args:
         arrow: Direction of the arrow on the card, as seen by the viewer.
         mirrored: True if the text on the card appears mirrored.
-
-    Raises:
-        ValueError: The arrow cannot point in this direction, however the panel is mounted.
     """
     mirror = "horizontal" if mirrored else "none"
+    rotation_of = {}  # by the direction in which the arrow then points
     for rotation_deg in ROTATIONS:
         seen = panel_from_screen(screen_width_px=1, screen_height_px=1, rotation_deg=rotation_deg, mirror=mirror)
-        if tuple(round(value) for value in seen[:2, :2] @ [0.0, -1.0]) == DIRECTIONS[arrow]:
-            return rotation_deg, mirror
-    raise ValueError(f"no mounting makes the arrow point {arrow}")
+        rotation_of[tuple(round(value) for value in seen[:2, :2] @ [0.0, -1.0])] = rotation_deg
+    return rotation_of[DIRECTIONS[arrow]], mirror

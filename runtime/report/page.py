@@ -129,7 +129,6 @@ def describe() -> dict[str, str]:
         "cores": str(len(os.sched_getaffinity(0))),
         "memory": f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.1f} GiB",
         "system": f"{platform.system()} {platform.release()}",
-        "seed": "0",  # seed for all random numbers in a report
         "Python": platform.python_version(),
     }
     for name in PACKAGES:

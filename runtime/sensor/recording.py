@@ -65,16 +65,16 @@ class RecordingWriter:
 
         Args:
             file: Empty binary file. The caller closes it.
-            header: Recording properties. Pictures are written only if `colour` or `depth` is set.
+            header: Recording properties. Colour is written only if `colour` is set, and depth if `depth` is.
             max_s: Maximum time between the first and the last sample.
             on_first: Function to call after the first sample has been written.
         """
         from mcap.writer import CompressionType, IndexType, Writer
 
         self._file, self._max_ns, self._on_first = file, round(max_s * NS_PER_S), on_first
-        self._images = header.colour or header.depth
+        self._header, has_images = header, header.colour or header.depth
         # Without compression, eye-point files do not depend on a library's version.
-        compression = CompressionType.LZ4 if self._images else CompressionType.NONE
+        compression = CompressionType.LZ4 if has_images else CompressionType.NONE
         index = IndexType.CHUNK | IndexType.METADATA
         self._writer: Any = Writer(file, chunk_size=CHUNK_BYTES, compression=compression, index_types=index)
         self._writer.start(profile="phasestack", library="phasestack")
@@ -98,13 +98,14 @@ class RecordingWriter:
 
         Returns False, and writes nothing, if the sample would exceed the maximum duration or size.
         """
-        at = frame.capture_ns
+        at, header = frame.capture_ns, self._header
         messages: list[tuple[str, bytes]] = []
-        if self._images and frame.intrinsics is not None and frame.intrinsics != self._intrinsics:
+        has_images = header.colour or header.depth
+        if has_images and frame.intrinsics is not None and frame.intrinsics != self._intrinsics:
             messages.append((fmt.CALIBRATION_TOPIC, fmt.calibration_message(frame.intrinsics, capture_ns=at)))
-        if self._images and frame.colour is not None:
+        if header.colour and frame.colour is not None:
             messages.append((fmt.COLOUR_TOPIC, fmt.colour_message(frame.colour, capture_ns=at)))
-        if self._images and frame.depth_mm is not None:
+        if header.depth and frame.depth_mm is not None:
             messages.append((fmt.DEPTH_TOPIC, fmt.depth_message(frame.depth_mm, capture_ns=at)))
         messages.append((fmt.EYES_TOPIC, fmt.eyes_message(frame)))
         first_ns = at if self._first_ns is None else self._first_ns

@@ -64,6 +64,31 @@ def checked_path(path: str | Path, *, source: str | Path = "", field: str = "") 
     return Path(path)
 
 
+def path_within_folder(path: str, *, source: str | Path, field: str) -> Path:
+    """Check that a relative path does not leave its folder, and return the normalized path.
+
+    The path need not exist. Symbolic links are not resolved, because the owner of the folder has put them there.
+
+    Args:
+        path: Path in an untrusted file, relative to the folder of that file.
+        source: File to name in messages.
+        field: Field to name in messages.
+
+    Raises:
+        InputError: The path is invalid, absolute, or leads out of the folder.
+    """
+    name = Path(os.path.normpath(checked_path(path, source=source, field=field)))
+    if name.is_absolute():
+        problem = "is an absolute path"
+    elif name.parts[:1] == (os.pardir,):
+        problem = "is outside this file's folder"
+    else:
+        return name
+    raise InputError(
+        source, field, f"{shown(path, most=200)} {problem}; only files in this folder or below it are read"
+    )
+
+
 def is_there(path: str | Path, *, folder: bool = False) -> bool:
     """Return True if a path exists.
 

@@ -136,6 +136,15 @@ def test_photographs_that_cannot_be_used_are_named_and_nothing_is_written(
     assert not (tmp_path / "r").exists()
 
 
+def test_a_configuration_that_cannot_be_updated_leaves_no_registration(tmp_path: Path, photos: Path) -> None:
+    config = tmp_path / f"{'c' * 250}.toml"  # has no room for the number of a kept version
+    config.write_text(CONFIG)
+    with pytest.raises(InputError, match="cannot be written"):
+        panels("--photos", str(photos), "--out", str(tmp_path / "r"), "--config", str(config), "--write")
+    assert config.read_text() == CONFIG
+    assert not (tmp_path / "r").exists()
+
+
 WRONG = [
     "charts --out x --config no-such-file.toml",
     "grey --out l.csv --photos none --panel 1",

@@ -61,16 +61,17 @@ def test_the_published_prototype_is_reported_without_its_points(tmp_path: Path) 
 
 
 @pytest.mark.parametrize(
-    "data",
+    ("data", "told"),
     [
-        "sensor_m = [[1, 2]]\nstack_m = [[1, 2, 3]]\nused = [true]\nnames = ['a']",
-        "sensor_m = [[1, 2, 3]]\nstack_m = [[1, 2, 3]]\nused = [true, true]\nnames = ['a']",
-        "sensor_m = [[1, 2, nan]]\nstack_m = [[1, 2, 3]]\nused = [true]\nnames = ['a']",
+        ("sensor_m = [[1, 2]]\nstack_m = [[1, 2, 3]]\nused = [true]\nnames = ['a']", "data"),
+        ("sensor_m = [[1, 2, 3]]\nstack_m = [[1, 2, 3]]\nused = [true, true]\nnames = ['a']", "data.*differ in length"),
+        ("sensor_m = [[1, 2, 3]]\nstack_m = [[1, 2, 3]]\nused = [false]\nnames = ['a']", "data.*true for no pair"),
+        ("sensor_m = [[1, 2, nan]]\nstack_m = [[1, 2, 3]]\nused = [true]\nnames = ['a']", "data"),
     ],
 )
-def test_spoiled_points_are_refused_and_nothing_is_written(tmp_path: Path, data: str) -> None:
+def test_spoiled_points_are_refused_and_nothing_is_written(tmp_path: Path, data: str, told: str) -> None:
     path = tmp_path / "c.toml"
     path.write_text(PUBLISHED + "[data]\n" + data + "\n")
-    with pytest.raises(InputError, match="data"):
+    with pytest.raises(InputError, match=told):
         report(str(path), "--out", str(tmp_path / "r"))
     assert not (tmp_path / "r").exists()

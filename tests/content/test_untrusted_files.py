@@ -292,7 +292,7 @@ GLTFS: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "an address": (
         gltf(buffers=[{"byteLength": 48, "uri": "http://localhost/a.bin"}]),
-        "is not a file next to this one",
+        "is not a file in the folder",
     ),
     "an absolute path": (gltf(buffers=[{"byteLength": 48, "uri": "/etc/passwd"}]), "is an absolute path"),
     "a device": (gltf(buffers=[{"byteLength": 48, "uri": "zero.bin"}]), "uri: is a device"),
@@ -347,6 +347,18 @@ def test_a_gltf_is_refused_by_what_it_says_of_itself(tmp_path: Path, name: str) 
     else:  # strange, and bounded
         load_mesh(path)
     assert time.monotonic() - start < HANG_S
+
+
+@pytest.mark.parametrize("suffix", [".gltf", ".obj"])
+@pytest.mark.parametrize("name", ["../skin.png", "maps/../../skin.png"])
+def test_a_mesh_reads_nothing_outside_its_folder(tmp_path: Path, suffix: str, name: str) -> None:
+    path = tmp_path / "scene" / f"a{suffix}"
+    (path.parent / "maps").mkdir(parents=True)
+    (tmp_path / "skin.png").write_bytes(png(4, 4))
+    (path.parent / "a.mtl").write_text(f"newmtl a\nmap_Kd {name}\n")
+    obj = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nusemtl a\nf 1/1 2/1 3/1\n"
+    path.write_text(obj if suffix == ".obj" else json.dumps(textured(0, [{"source": 0}], [{"uri": name}])))
+    assert f"{name} is outside this file's folder" in refused(path)
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import grp
 import os
 import socket
@@ -161,6 +162,18 @@ def test_without_a_daemon_the_client_says_what_to_do(path: Path) -> None:
         status(path)
 
 
+def test_an_answer_that_is_no_object_is_of_no_daemon(path: Path) -> None:
+    path.parent.mkdir()
+    with socket.socket(socket.AF_UNIX) as other, ThreadPoolExecutor() as pool:
+        other.bind(str(path))
+        other.listen()
+        asked = pool.submit(status, path)
+        with other.accept()[0] as client:
+            client.sendall(b"[1]\n")
+            with pytest.raises(NotRunning, match="the answer is not a JSON object"):
+                asked.result(timeout=20)
+
+
 def connected(path: Path) -> socket.socket:
     client = socket.socket(socket.AF_UNIX)
     client.settimeout(20)
@@ -249,6 +262,20 @@ def test_an_asker_that_only_sends_no_more_is_still_there(server: StatusServer, p
         assert waiting.take()
         waiting.done(flat=True)
         assert b'"flat": true' in client.recv(1000)
+
+
+def test_a_folder_that_stays_locked_is_used_and_a_line_says_so(
+    path: Path, clock: SimulatedClock, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("runtime.daemon.socket_file.LOCKED_WITHIN_S", 0.05)
+    path.parent.mkdir()
+    other = os.open(path.parent, os.O_RDONLY)
+    fcntl.flock(other, fcntl.LOCK_EX)
+    made = StatusServer(path, clock=clock)
+    assert status(path)["ok"]
+    made.close()
+    os.close(other)
+    assert f"{path.parent} is locked by another program" in caplog.text
 
 
 TAKES_IT = """

@@ -383,3 +383,27 @@ def test_a_model_whose_rasters_are_not_timed_yet_stops_no_refresh(stage: Stage) 
     stage.solver.reductions, stage.solver.solve_cost_ns = (1, 2, 3, 4), 300 * NS_PER_MS
     stage.refresh(30)
     assert stage.solver.requests[-1].effort.reduction > 1
+
+
+def test_a_solver_that_has_not_started_yet_stops_no_refresh(stage: Stage) -> None:
+    stage.solver.reductions = ()
+    stage.eyes = moves
+    before = stage.presenter.stats.frames
+    stage.refresh(30)
+    assert stage.presenter.stats.frames == before + 30
+
+
+def test_a_moving_head_about_to_be_given_up_gets_no_long_solution(stage: Stage) -> None:
+    """Otherwise the solver is busy when the head comes back."""
+    model = Named("model of four rasters")
+    model.reductions = stage.solver.reductions = (1, 2, 3, 4)
+    stage.solver.solve_cost_ns = 400 * NS_PER_MS
+    stage.cell.replace(predictor=model)
+    stage.eyes = moves
+    stage.refresh(90)
+    stage.eyes = lambda _: None
+    stage.refresh(60)
+    assert stage.presenter.machine.state is State.FLAT
+    after_loss = [request for request in stage.solver.requests[-60:] if request.eyes_m is not None]
+    assert len(after_loss) > 10
+    assert all(request.effort.reduction > 1 for request in after_loss)

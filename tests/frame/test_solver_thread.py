@@ -371,7 +371,7 @@ def test_a_task_may_take_longer_than_a_step(shop: Workshop, monkeypatch: pytest.
     gate.set()
 
 
-def test_where_no_thread_can_be_started_what_hangs_is_left_behind_later(
+def test_where_no_thread_can_be_started_what_hangs_is_abandoned_later(
     shop: Workshop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At the limit of tasks the next fault ended the display."""

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from runtime.config import ModelSettings
-from runtime.errors import ContextLost, InputError, MissingPart
+from runtime.errors import ContextLost, InputError, MissingPart, ModelFailure
 from runtime.evaluation.displayed import displayed, expected_quality
 from runtime.model.backends import choose
 from runtime.model.gl.state import GlBackend, GlState
@@ -239,6 +239,25 @@ def test_without_opengl_automatic_is_the_processor_and_gl_is_refused() -> None:
     assert "OpenGL is not available" in choice.why
     with pytest.raises(MissingPart):
         choose("gl", predictor, nothing)
+
+
+@pytest.mark.parametrize("failing", ["cpu", "gl"])
+def test_automatic_is_the_processor_and_says_which_backend_failed(
+    gl: GlBackend, monkeypatch: pytest.MonkeyPatch, failing: str
+) -> None:
+    predictor = load_predictor("fast", STACK)
+    solver = type(predictor.on_panels(STACK))
+    real = solver.solve
+
+    def solved(self: Any, job: Any) -> Any:
+        if self.backend == failing:
+            raise ModelFailure("the network's output is not finite")
+        return real(self, job)
+
+    monkeypatch.setattr(solver, "solve", solved)
+    choice = choose("auto", predictor, lambda: gl.passes.context)
+    assert choice.backend.name == "cpu"
+    assert choice.why == f"a solution on {failing} failed: the network's output is not finite"
 
 
 def test_a_model_that_has_one_backend_keeps_it() -> None:

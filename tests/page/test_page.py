@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import errno
+import http.client
 import json
 import os
 import resource
 import socket
 import stat
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -19,7 +21,7 @@ import pytest
 
 from runtime.clock import MonotonicClock
 from runtime.commands.page import page as page_command
-from runtime.daemon.client import DaemonClient
+from runtime.daemon.client import REQUEST_S, DaemonClient
 from runtime.daemon.server import StatusServer
 from runtime.errors import InputError, TransientError
 from runtime.page.connections import CONNECTIONS_MAX
@@ -240,6 +242,19 @@ def test_connections_that_ask_nothing_shut_nobody_out(page: Page, loop: Loop) ->
     finally:
         for client in held:
             client.close()
+
+
+def test_a_connection_that_asks_again_and_again_stays_open(page: Page, loop: Loop) -> None:
+    """It was cut `REQUEST_S` after it was opened, right after an answer."""
+    channel = http.client.HTTPConnection("localhost", page.port, timeout=90)
+    channel.connect()
+    channel.auto_open = 0  # a connection that was cut is not replaced
+    opened_s = time.monotonic()
+    while time.monotonic() < opened_s + 1.2 * REQUEST_S:
+        channel.request("GET", "/now/status", headers=page.bearer)
+        assert channel.getresponse().read()
+        time.sleep(0.05 * REQUEST_S)
+    channel.close()
 
 
 @pytest.mark.parametrize(

@@ -107,6 +107,15 @@ def test_images_are_recorded_only_with_a_header_that_says_so(tmp_path: Path) -> 
     assert b"/colour" not in (tmp_path / "eyes.mcap").read_bytes()
 
 
+@pytest.mark.parametrize("kept", ["colour", "depth"])
+def test_only_the_kind_of_picture_that_the_header_names_is_written(tmp_path: Path, kept: str) -> None:
+    frame = sample(1, colour=np.zeros((48, 64, 3), np.uint8), depth_mm=np.ones((48, 64), np.uint16), intrinsics=CAMERA)
+    write(tmp_path / "a.mcap", [frame], RecordingHeader(driver="test", **{kept: True}))
+    back = Recording(tmp_path / "a.mcap").first
+    assert (back.colour is not None, back.depth_mm is not None) == (kept == "colour", kept == "depth")
+    assert back.intrinsics == CAMERA
+
+
 def test_images_do_not_pile_up_in_memory(tmp_path: Path) -> None:
     depth = np.zeros((480, 640), np.uint16)
     write(tmp_path / "a.mcap", [sample(k, depth_mm=depth) for k in range(30)], WITH_IMAGES)

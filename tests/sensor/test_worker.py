@@ -177,7 +177,7 @@ def test_the_end_of_a_recording_is_reported_after_its_last_sample(started: Calla
 
 
 @pytest.mark.parametrize("where", ["open", "read"])
-def test_an_sdk_that_hangs_is_left_behind_and_never_blocks_the_loop(
+def test_an_sdk_that_hangs_is_abandoned_and_never_blocks_the_loop(
     started: Callable[..., Any], where: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("runtime.sensor.worker.HANG_MARGIN_S", 0.1)
