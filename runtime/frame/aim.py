@@ -40,8 +40,8 @@ class Aim:
         self._chooser = EffortChooser()
         self._calm_ns: int | None = None  # when the head's speed fell below CALM_M_S
         self._expected: dict[int, float] = {}  # expected squared distance to the true eyes, m², by requested time
-        # Effort chosen when the head was last seen. A lost head keeps it, because the error at an unknown position favours
-        # long solutions, and the solver would still be busy when the head returns.
+        # Effort chosen when the head was last seen. A lost head keeps it: the error at an unknown position favours long
+        # solutions, and the solver would still be busy when the head returns.
         self._seen_effort: Effort | None = None
         self._speed2 = 0.0  # running mean of the squared speed, in (m/s)²
         self._learned: int | None = None  # number of the latest solution whose measures have been used
