@@ -14,7 +14,7 @@ app = typer.Typer()
 def bench(
     context: typer.Context,
     out: Annotated[Path | None, typer.Option(help="write the measurement to this JSON file")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="print the result as one JSON object")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print the result as a JSON object")] = False,
 ) -> None:
     """Measure the shipped models' run time, memory and light PSNR, or compare two measurements.
 
@@ -43,7 +43,7 @@ def bench(
 def compare(
     old: Annotated[Path, typer.Argument(help="JSON file with the earlier measurement")],
     new: Annotated[Path, typer.Argument(help="JSON file with the later measurement")],
-    as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print the comparison as a JSON object")] = False,
 ) -> None:
     """List every figure that changed by more than the noise. Exits with 1 if any figure got worse.
 

@@ -52,7 +52,7 @@ def doctor(
             "--service", help="check with the user, groups and configuration of the systemd service; requires root"
         ),
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print the result as one JSON object")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print the result as a JSON object")] = False,
 ) -> None:
     """Check the settings, sensor, permissions, OpenGL, monitors, scene, model, calibration and service.
 

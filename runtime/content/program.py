@@ -47,7 +47,7 @@ SIDES = ("left", "right")
 class ProgramOptions(Section):
     """Options in [content.options] for the scene `program`."""
 
-    port: int = Field(0, ge=0, le=65535, description="TCP port to listen on; 0 for any free port")
+    port: int = Field(0, ge=0, le=65535, description="TCP port to listen on (0 for any free port)")
 
 
 def prepare(file: SceneFile) -> Callable[[Any], ContentSource]:
