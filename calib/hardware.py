@@ -118,7 +118,7 @@ class SetupHardware:
         self._display = open_display(settings, grey_curve=panel is None)
         try:
             self._display.show(grey_layers(pictures))
-            say(f"put {count} into {folder}, then press Enter, or q to stop")
+            say(f"put {count} into {folder} and press Enter, or press q to stop")
             while (key := self.key()) is not Key.ACCEPT:
                 if key is Key.QUIT:
                     raise InputError(

@@ -134,14 +134,16 @@ def probe(network: Network, *, width_px: int, height_px: int) -> None:
     with torch.no_grad(), blamed(arch, f"forward, of {tuple(example.shape)}"):
         answer = network.net.eval()(example)
     if not isinstance(answer, Tensor):
-        raise InputError(arch, "forward", f"returns {type(answer).__name__}, but must return one tensor")
+        raise InputError(
+            arch, "forward", f"returns an object of type {type(answer).__name__}, but must return a single tensor"
+        )
     shape = tuple(answer.shape)
     for axis, size, needed in zip(("batch", "channels", "height", "width"), shape, expected, strict=False):
         if size != needed or len(shape) != len(expected):
-            problem = f"returns the shape {shape} instead of {expected}; check the {axis}"
+            problem = f"returns a tensor of shape {shape} instead of {expected}; check the {axis}"
             raise InputError(arch, "forward", f"{problem} ({PANELS} panels of {COLOURS} colours)")
     if answer.dtype != torch.float32:
-        raise InputError(arch, "forward", f"returns {answer.dtype} instead of torch.float32")
+        raise InputError(arch, "forward", f"returns a tensor of type {answer.dtype} instead of torch.float32")
     if not torch.isfinite(answer).all():
         raise InputError(arch, "forward", "returns numbers that are not finite")
 

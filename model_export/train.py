@@ -114,7 +114,7 @@ def run_training(out: Path, training: Training, *, device: Device = "auto", resu
                 loss.backward()  # type: ignore[no-untyped-call]
             if not torch.isfinite(loss):
                 raise InputError(
-                    training.arch, f"iteration {number}", "the light is not finite; lower the learning rate"
+                    training.arch, f"iteration {number}", "the measured light is not finite; lower the learning rate"
                 )
             nn.utils.clip_grad_norm_(net.parameters(), 1.0)
             optimizer.step()

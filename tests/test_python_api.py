@@ -237,9 +237,9 @@ def test_anybody_s_layers_are_evaluated_as_ours_are() -> None:
     assert phasestack.evaluate(result.layers / 255, picture(), picture(3), **how) == result.quality
     with pytest.raises(ValueError, match=r"layers: .*channels must come last, so pass np.moveaxis\(layers, 1, -1\)"):
         phasestack.evaluate(np.moveaxis(result.layers, 3, 1), picture(), picture(3), **how)
-    with pytest.raises(ValueError, match=r"layers: must have the shape .*, not \(2, "):
+    with pytest.raises(ValueError, match=r"layers: must have shape .*, but has shape \(2, "):
         phasestack.evaluate(result.layers[:2], picture(), picture(3), **how)
-    with pytest.raises(ValueError, match=r"layers: must have the shape .*for grey layers, pass np.stack"):
+    with pytest.raises(ValueError, match=r"layers: must have shape .*for grey layers, pass np.stack"):
         phasestack.evaluate(result.layers[..., 0], picture(), picture(3), **how)
     with pytest.raises(ValueError, match=r"layers: values must be at most 1.*if they are angles in radians"):
         phasestack.evaluate(result.layers / 255 * np.pi / 2, picture(), picture(3), **how)
