@@ -69,7 +69,7 @@ def compare(
         print(f"the reference workload took {speed:.2f} times as long as before; solution times are scaled to match")
         for change in sorted(changes, key=lambda change: not change.worse):
             print(f"{'worse ' if change.worse else 'better'} {change.what}: {change.text}")
-        again = ", but run times could not be compared; measure again on an idle machine" if busy else ""
+        again = " (run times could not be compared; measure again on an idle machine)" if busy else ""
         ends = f"{len(worse)} worse, {len(changes) - len(worse)} better"
         print(ends if changes else f"no figure changed by more than the noise{again}")
     if worse:

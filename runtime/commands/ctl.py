@@ -68,7 +68,7 @@ def place(
     value = {name: option for name, option in options.items() if option is not None}
     if reset == bool(value):
         raise InputError(
-            "ctl place", "", "pass either --reset or at least one of --scale, --offset, --rotate and --turntable"
+            "ctl place", "", "pass either --reset, or at least one of --scale, --offset, --rotate and --turntable"
         )
     tell({"command": "place", "value": None if reset else value}, config)
 
@@ -135,7 +135,7 @@ def _advised(error: Exception) -> str:
 
     advice = unit_advice()
     if not advice and any(each in str(error) for each in ("no daemon", "has died")):
-        advice = "start one with `phasestack run` or, without hardware, `phasestack try`"
+        advice = "start one with `phasestack run`, or use `phasestack try` if there is no hardware"
     return "; ".join(filter(None, (str(error), advice)))
 
 

@@ -95,7 +95,7 @@ def _refuse_target(out: Path, *, motion: bool) -> None:
 
     checked_path(out, source="record", field="--out")
     if out.suffix.lower() != SUFFIX:
-        raise InputError(out, "--out", f"must end in {SUFFIX}, because recordings are MCAP files")
+        raise InputError(out, "--out", f"must end in {SUFFIX} because recordings are MCAP files")
     if os.path.isdir(out):  # noqa: PTH112 - Path.is_dir raises if a parent folder is not accessible
         raise InputError(out, "--out", "is a folder; pass the name of a file")
     if not os.path.lexists(out):

@@ -57,4 +57,4 @@ def report(
             f"{result['name']:18}{size:>11}{result['ms_p50']:10.1f} ms   "
             f"light {light:6.2f} dB, one ray {result['psnr_db']:6.2f} dB {result['memory_mib']:7.0f} MiB"
         )
-    print(f"see {out / 'index.html'} (quote the light PSNR, which assumes a tracking error of 1 mm)")
+    print(f"see {out / 'index.html'} (the figure to quote is the light PSNR, which assumes a tracking error of 1 mm)")

@@ -77,5 +77,5 @@ def solve(
         )
     typer.echo(shown(result, as_json=as_json))
     if not as_json:
-        typer.echo("quote light_db, which assumes a tracking error of 1 mm")
+        typer.echo("the figure to quote is light_db, which assumes a tracking error of 1 mm")
         typer.echo(f"see {out / 'contact-sheet.png'}, or open {out / 'viewer.html'} to look around")

@@ -207,7 +207,8 @@ class ContentSettings(Section):
     layout: Annotated[str, Field(pattern=LAYOUT)] = Field(
         "auto",
         description="arrangement of the views: mono, [half-]side-by-side, [half-]top-bottom, [half-]cross-eyed (right "
-        "view on the left), anaglyph, rgbd or a quilt such as qs8x6a0.75; auto derives the layout from the file name",
+        "view on the left), anaglyph, rgbd or a quilt such as qs8x6a0.75; auto detects it from the file's metadata or "
+        "name",
     )
     cone_deg: Annotated[float, Field(gt=0, lt=180)] = Field(
         40.0, description="angle between the outermost views of a quilt"

@@ -141,10 +141,10 @@ def _file_of(uri: str, *, source: Path, field: str) -> Path:
     """
     shown = untrusted_input.shown(uri, most=200)
     if "://" in uri or uri.startswith("data:"):
-        raise InputError(source, field, f"{shown} is not a file next to this one; only such files are read")
+        raise InputError(source, field, f"{shown} is not a local file; only files in this file's folder are read")
     name = untrusted_input.checked_path(unquote(uri), source=source, field=field)
     if name.is_absolute():
-        raise InputError(source, field, f"{shown} is an absolute path; only files next to this one are read")
+        raise InputError(source, field, f"{shown} is an absolute path; only files in this file's folder are read")
     if not (source.parent / name).exists():
         raise InputError(source, field, f"{shown} does not exist")
     return source.parent / name

@@ -75,7 +75,9 @@ def read_playlist(path: Path, settings: ContentSettings) -> Playlist:
     if "frames" in table and "show" not in table:
         raise InputError(path, "", f"is a set of cameras for training a NeRF; {CAMERA_SET}")
     if path.suffix.lower() == ".json" and "show" not in table:
-        raise InputError(path, "show", "is missing; a JSON file must be a playlist that lists its scenes here")
+        raise InputError(
+            path, "show", "is missing; a JSON file must be a playlist, with its scenes listed under `show`"
+        )
     file = validated(PlaylistFile, table, source=path)
     common = settings.model_dump(exclude={"scene", "file", *FIELDS})
     entries = []
