@@ -94,7 +94,7 @@ def test_pictures_are_codes_or_intensities_with_or_without_transparency() -> Non
         ({"right": picture().astype(np.float32)}, "right: .*if white is 255"),
         ({"fov_deg": "40"}, "fov_deg: must be a number of degrees, not '40'"),
         ({"model": 3}, "model: must be fast, balanced, best, sart or an ONNX file, not 3"),
-        ({"cameras": np.zeros((2, 4, 4))}, "cameras: must be a left and a right 3x4 matrix"),
+        ({"cameras": np.zeros((2, 4, 4))}, "cameras: must be two 3x4 matrices"),
         ({"cameras": np.zeros((2, 3, 4))}, "cameras: must be matrices"),
         ({"cameras": [phasestack.camera(eye, width_px=320, height_px=180) for eye in EYES[::-1]]}, "cameras: are at"),
         ({"fov_deg": 190.0}, "fov_deg"),

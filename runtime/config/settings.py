@@ -366,7 +366,7 @@ class LoopSettings(Section):
     )
     evaluate_every: Annotated[int, Field(ge=0)] = Field(
         20,
-        description="with --out: measure quality every N refreshes (fewer if needed to keep up in real time); 0 "
+        description="with --out: measure quality every N refreshes (less often if needed to keep up in real time); 0 "
         "measures only the last refresh",
     )
 

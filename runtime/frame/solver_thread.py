@@ -170,7 +170,7 @@ class SolverThread(SolverHost):
                     attempt.abandoned.set()
                 self._hung.append(attempt)
                 self.restarts += 1
-                log.error("the solver has not answered for %.1f s; starting a new one in its place", busy_ns / NS_PER_S)
+                log.error("the solver has not answered for %.1f s; starting a new one", busy_ns / NS_PER_S)
         busy_ms = busy_ns // NS_PER_MS // ANSWER_STEP_MS * ANSWER_STEP_MS
         return f"the solver {'has not answered' if attempt.ready.is_set() else 'has been restarting'} for {busy_ms} ms"
 

@@ -250,7 +250,7 @@ def depth_from_message(data: bytes) -> U16:
     raw = base64.b64decode(image.data)
     if len(raw) != 2 * image.width * image.height:
         raise ValueError(
-            f"a depth image has {len(raw)} bytes, but {image.width} x {image.height} pixels need two bytes each"
+            f"a depth image has {len(raw)} bytes, but {image.width} x {image.height} pixels require two bytes each"
         )
     return np.frombuffer(raw, "<u2").reshape(image.height, image.width).astype(np.uint16)
 

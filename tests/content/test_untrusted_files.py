@@ -231,7 +231,7 @@ def ply(folder: Path, vertices: Any, faces: Any, form: str = "binary_little_endi
         (9, 1_999_999, "the file is truncated; the header declares 1,999,999 elements"),
         ("²", 1, "element vertex: must be a non-negative whole number, not ²"),
         (9, "²", "element face: must be a non-negative whole number, not ²"),
-        ("9" * 5000, 1, "element vertex: must not have 5000 digits"),
+        ("9" * 5000, 1, "element vertex: has 5000 digits"),
         (9, "-4", "element face: must be a non-negative whole number, not -4"),
     ],
 )
