@@ -210,7 +210,7 @@ def _quarter(out: F64, guess: F64) -> F64:
 
 
 def _samples(picture: U8, points: F64) -> F64:
-    """Sample a picture at positions (..., 2) in pixels with bilinear interpolation."""
+    """Sample a picture at pixel coordinates (..., 2), using bilinear interpolation."""
     flat = np.ascontiguousarray(points.reshape(-1, 1, 2).astype(np.float32))
     values = cv2.remap(picture, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(values, dtype=np.float64).reshape(points.shape[:-1])

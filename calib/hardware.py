@@ -103,7 +103,8 @@ class SetupHardware:
 
         Args:
             settings: Display configuration.
-            pictures: One grey picture per panel (N, H, W): the boards, or one panel's grey chart.
+            pictures: (N, H, W) grey pictures, one per panel: the boards, or the grey chart on one panel and nothing on
+                the others.
             panel: Index of the panel that shows the grey chart, with no grey curve applied, or None if the boards are
                 shown.
             say: Function that shows a line of text to the user.

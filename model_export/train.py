@@ -270,7 +270,7 @@ def _resumed(
         out: Folder that contains the checkpoint.
         training: Settings, which must equal those in the checkpoint.
         network: Network that receives the weights.
-        *parts: Optimizer and learning rate scheduler, which receive their states.
+        *parts: Optimizer and learning rate scheduler whose states are to be restored.
 
     Returns:
         The number of completed iterations, the learning curve, and the light PSNR of every iteration since the curve's

@@ -147,7 +147,7 @@ class TrackerSettings(Section):
 
 
 class CalibrationSettings(Section):
-    """Calibration that maps the sensor frame to the stack frame, and the viewing range."""
+    """The viewing range, and the calibration that maps the sensor frame to the stack frame."""
 
     file: PathText = Field(
         "", description="calibration file (TOML); leave empty to use the demo recording's calibration"

@@ -42,7 +42,7 @@ class Pair:
 
 
 def is_data_set(folder: Path) -> bool:
-    """Return True if a folder contains a picture named as in the data set."""
+    """Return True if a folder contains a picture whose name follows the data set's naming scheme."""
     return folder.is_dir() and any(NAME.match(path.name) for path in folder.iterdir())
 
 

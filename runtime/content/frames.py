@@ -56,7 +56,7 @@ class Frames(ABC):
 
     @abstractmethod
     def frame(self, index: int) -> U8:
-        """Return an RGB picture (h, w, 3) that contains all views of its layout.
+        """Return the frame at `index` as an RGB picture (h, w, 3) containing every view in the layout.
 
         Raises ContentFailure if the picture cannot be decoded.
         """

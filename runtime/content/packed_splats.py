@@ -91,7 +91,9 @@ def load_splat(path: Path) -> Gaussians:
 
 
 def fields_of(packed: U32, bits: tuple[int, ...]) -> F32:
-    """Unpack bit fields from words, as fractions (n, len(bits)) of each field's largest value.
+    """Unpack bit fields from words and scale each by its maximum value.
+
+    The result is fractions of shape (n, len(bits)).
 
     Args:
         packed: Words (n,).

@@ -140,7 +140,7 @@ class SolverThread(SolverHost):
             thread.join(patience_s(timeout_s))
 
     def _late_reason(self) -> str:
-        """Replace the thread if it hangs, and return the reason why the solver is unavailable or late.
+        """Replace the thread if it has hung, and return the reason why the solver is unavailable or late.
 
         Returns "" if the solver is working on time.
         """

@@ -70,7 +70,7 @@ def align(stack: PanelStack, *, solved_for_m: F64, eyes_m: F64) -> Alignment:
 
     Args:
         solved_for_m: (2, 3) eyes that the layers were solved for, in frame `stack`.
-        eyes_m: (2, 3) current eyes in frame `stack`.
+        eyes_m: (2, 3) current eye positions in frame `stack`.
     """
     if not (np.abs(solved_for_m).max() <= FARTHEST_M and np.abs(eyes_m).max() <= FARTHEST_M):  # also catches NaN
         return Alignment(_as_they_are(stack), "the eye positions are not finite")

@@ -211,7 +211,7 @@ class Display:
         """Return a window's state, or None if another program has destroyed it.
 
         Returns:
-            True if the window is mapped, and the region of the X screen it covers.
+            A tuple: whether the window is mapped, and the region of the X screen that it covers.
         """
         refused = xlib.refusals()
         place = Rectangle(*glfw.get_window_pos(window.handle), *glfw.get_window_size(window.handle))
