@@ -56,7 +56,7 @@ class GrowingPage:
         """Write all results measured so far. Raises InputError if the files cannot be written."""
         doing = self.record.get("measuring")
         notes = (
-            [f"This report is unfinished; results are added as they come in. Last known step: {doing}."]
+            [f"This report is not finished; results are added as they come in. Last known step: {doing}."]
             if doing
             else []
         )
