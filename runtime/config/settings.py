@@ -150,7 +150,7 @@ class CalibrationSettings(Section):
     """The viewing range, and the calibration that maps the sensor frame to the stack frame."""
 
     file: PathText = Field(
-        "", description="calibration file (TOML); leave empty to use the demo recording's calibration"
+        "", description="calibration file in TOML format (leave empty to use the demo recording's calibration)"
     )
     ipd_m: Annotated[float, within(0.04, 0.08, "m", zero=True)] = Field(
         0.0,
