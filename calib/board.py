@@ -74,7 +74,7 @@ def marks(stack: PanelStack) -> tuple[Mark, ...]:
         raise InputError(
             "stack",
             "x_m",
-            f"has more panels than the calibration boards support; the maximum is {DICTIONARY_SIZE // PER_PANEL}",
+            f"has more panels than the calibration boards support (at most {DICTIONARY_SIZE // PER_PANEL})",
         )
     unit = max(2, round(min(stack.width_px * 9 / 16, stack.height_px) / BITS_ON_SHORT_SIDE))
     tile = TILE * unit
@@ -84,7 +84,7 @@ def marks(stack: PanelStack) -> tuple[Mark, ...]:
         raise InputError(
             "stack",
             "width_px",
-            f"is too small; the boards need panels of at least {ACROSS * tile}x{DOWN * tile} pixels",
+            f"is too small for the boards; panels must have at least {ACROSS * tile}x{DOWN * tile} pixels",
         )
     every = []
     random = np.random.default_rng(16)  # fixed seed, so that photographs match the board

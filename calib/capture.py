@@ -151,7 +151,7 @@ class Walk:
         middle_m, spread_m = seen
         spread = f"{spread_m * 1e3:.1f}"
         if spread_m > MAX_SPREAD_M:
-            self._say(f"{viewpoint.name}: rejected because the eye positions scattered by {spread} mm; hold still")
+            self._say(f"{viewpoint.name}: rejected because the eye positions varied by {spread} mm; hold still")
             return
         self._file.accept(
             PairRow.of(middle_m, viewpoint.midpoint_m, viewpoint.name, serial=self._serial, spread_mm=spread)

@@ -35,8 +35,9 @@ def check_pairs(pairs: Pairs) -> list[str]:
         raise InputError(
             pairs.source,
             "pairs",
-            "the sensor and stack frames are mirror images (negative determinant), so one axis points the wrong way; "
-            "the sensor's must point right, down and away from the camera, the stack's to the viewer, right and up",
+            "the sensor and stack frames are mirror images (negative determinant), so an axis points the wrong way; "
+            "the sensor's axes must point right, down and away from the camera, and the stack's axes towards the "
+            "viewer, right and up",
         )
     try:
         scale = float(fit(pairs.sensor_m, pairs.stack_m, rule="inverse").scale)
@@ -49,7 +50,7 @@ def check_pairs(pairs: Pairs) -> list[str]:
     first, _, third = extents(pairs.stack_m)
     if third > COPLANAR * first:
         return []
-    return ["all viewpoints are in one plane, so mirrored axes cannot be detected; add a viewpoint outside the plane"]
+    return ["all viewpoints lie in one plane, so mirrored axes cannot be detected; add a viewpoint outside that plane"]
 
 
 def check_solution(pairs: Pairs, solution: CalibrationSolution, volume_m: F64) -> list[str]:
@@ -81,8 +82,8 @@ def check_solution(pairs: Pairs, solution: CalibrationSolution, volume_m: F64) -
             pairs.source,
             "pairs",
             f"do not determine the calibration: {noise_m * 1e3:.1f} mm of noise would shift the eyes by "
-            f"{error_m * 1e3:.0f} mm on average (condition number {solution.condition:.3g}); "
-            "add viewpoints that are farther apart and not on one line",
+            f"{error_m * 1e3:.0f} mm on average (condition number {solution.condition:.3g}); add viewpoints that are "
+            "farther apart and not all on one line",
         )
     if error_m > WARN_EYE_ERROR_M:
         warnings.append(
@@ -97,7 +98,7 @@ def check_solution(pairs: Pairs, solution: CalibrationSolution, volume_m: F64) -
         warnings.append(f"{_listed(pairs, beyond)}: the residual exceeds {RESIDUAL_LIMIT_M * 1e3:.0f} mm")
     scale = float(solution.similarity.scale)
     if not 0.8 <= scale <= 1.25:
-        warnings.append(f"the scale is {scale:.5g}, but it must be about 1; check that both frames are in metres")
+        warnings.append(f"the scale is {scale:.5g}, but must be about 1; check that both frames are in metres")
     return warnings
 
 

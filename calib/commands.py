@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from runtime.config import Settings
 
 ConfigOption = Annotated[Path | None, typer.Option(help="configuration file (default: built-in settings)")]
-JsonOption = Annotated[bool, typer.Option("--json", help="print the result as one JSON object")]
+JsonOption = Annotated[bool, typer.Option("--json", help="print the result as a JSON object")]
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -29,9 +29,13 @@ app = typer.Typer(
 @app.command()
 def panels(
     out: Annotated[Path | None, typer.Option(help="folder to write the registration to")] = None,
-    photos: Annotated[Path | None, typer.Option(help="folder with 8 to 20 photographs of the boards")] = None,
-    show: Annotated[bool, typer.Option("--show", help="show the boards on the panels until Enter or q")] = False,
-    write: Annotated[bool, typer.Option("--write", help="write distances, tilts and homographies to --config")] = False,
+    photos: Annotated[Path | None, typer.Option(help="folder containing 8 to 20 photographs of the boards")] = None,
+    show: Annotated[
+        bool, typer.Option("--show", help="show the boards on the panels until Enter or q is pressed")
+    ] = False,
+    write: Annotated[
+        bool, typer.Option("--write", help="write distances, tilts and homographies to the --config file")
+    ] = False,
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -65,9 +69,11 @@ def panels(
 @app.command()
 def grey(
     out: Annotated[Path | None, typer.Option(help="CSV file to write the LUT to")] = None,
-    panel: Annotated[int, typer.Option(help="index of the panel; 0 is the rear panel", min=0)] = 0,
-    photos: Annotated[Path | None, typer.Option(help="folder with two or three photographs of the chart")] = None,
-    show: Annotated[bool, typer.Option("--show", help="show the chart on the panel until Enter or q")] = False,
+    panel: Annotated[int, typer.Option(help="index of the panel (0 for the rear panel)", min=0)] = 0,
+    photos: Annotated[Path | None, typer.Option(help="folder containing two or three photographs of the chart")] = None,
+    show: Annotated[
+        bool, typer.Option("--show", help="show the chart on the panel until Enter or q is pressed")
+    ] = False,
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -117,10 +123,10 @@ def charts(
 
 @app.command()
 def capture(
-    out: Annotated[Path, typer.Option(help="CSV file for the pairs; capture adds to an existing file")],
+    out: Annotated[Path, typer.Option(help="CSV file for the pairs (new pairs are appended to an existing file)")],
     config: ConfigOption = None,
     replay: Annotated[
-        str | None, typer.Option(help="recording to use instead of the sensor; `demo` uses the built-in recording")
+        str | None, typer.Option(help="recording to use instead of the sensor (`demo` for the built-in recording)")
     ] = None,
     show: Annotated[bool, typer.Option("--show", help="show the charts on the panels")] = False,
     as_json: JsonOption = False,
@@ -152,15 +158,18 @@ def capture(
 
 @app.command()
 def solve(
-    pairs: Annotated[Path, typer.Option(help="CSV or JSON file of point pairs (sensor_x, stack_x, ...) in metres")],
-    out: Annotated[Path, typer.Option(help="calibration file to write (TOML); an existing file is backed up")],
+    pairs: Annotated[
+        Path, typer.Option(help="CSV or JSON file containing point pairs in metres (sensor_x, stack_x, ...)")
+    ],
+    out: Annotated[Path, typer.Option(help="calibration file (TOML) to write (an existing file is backed up)")],
     method: Annotated[
         str,
         typer.Option(
-            help="seed, least-squares, inverse, robust or fixed-scale (default: the best method for these pairs)"
+            help="method to use: seed, least-squares, inverse, robust or fixed-scale (default: the best method "
+            "for these pairs)"
         ),
     ] = "",
-    scale: Annotated[float, number(*SCALE, help="known scale, for the method fixed-scale")] = 1.0,
+    scale: Annotated[float, number(*SCALE, help="known scale (only with the method fixed-scale)")] = 1.0,
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:

@@ -124,10 +124,10 @@ def _unreadable(counts: list[int], edges: list[float], unit_px: float) -> str:
         unit_px: Size of a marker bit in the photograph.
     """
     if sum(counts) == 0:
-        return "shows no marks of a board; check that it shows the display and is neither blurred nor too dark"
+        return "shows no marks because the display is out of view or the picture is blurred or too dark"
     edge_bits = float(np.median(edges))
     if edge_bits > BLURRED_BITS:
-        return f"is blurred, with edges {edge_bits * unit_px:.1f} px wide; take a sharper photograph"
+        return f"is blurred (edges are {edge_bits * unit_px:.1f} px wide); take a sharper photograph"
     if unit_px < MIN_UNIT_PX:
         return f"shows marks that are too small ({unit_px:.1f} px per bit); move closer or use a higher resolution"
     return ""
@@ -147,11 +147,15 @@ def _covered(counts: list[int], places: F64, owners: Any) -> str:
     fewest = min(counts)
     if fewest < MIN_MARKS:
         panel = counts.index(fewest)
-        return f"shows {fewest} marks of panel {panel}, but at least {MIN_MARKS} are needed; show the whole panel"
+        return (
+            f"shows {fewest} marks of panel {panel}, but at least {MIN_MARKS} are needed; keep the whole panel in view"
+        )
     for panel in range(len(counts)):
         share = float(np.ptp(places[owners == panel], axis=0).min())
         if share < MIN_EXTENT:
-            return f"shows only {100 * share:.0f}% of the width or height of panel {panel}; show the whole panel"
+            return (
+                f"shows only {100 * share:.0f}% of the width or height of panel {panel}; keep the whole panel in view"
+            )
     return ""
 
 
@@ -206,7 +210,7 @@ def _quarter(out: F64, guess: F64) -> F64:
 
 
 def _samples(picture: U8, points: F64) -> F64:
-    """Sample a picture at positions (..., 2) in pixels with bilinear interpolation."""
+    """Sample a picture at pixel coordinates (..., 2), using bilinear interpolation."""
     flat = np.ascontiguousarray(points.reshape(-1, 1, 2).astype(np.float32))
     values = cv2.remap(picture, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(values, dtype=np.float64).reshape(points.shape[:-1])

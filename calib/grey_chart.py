@@ -162,7 +162,8 @@ def histograms(picture: U8, stack: PanelStack, panel: int, *, source: str) -> F6
     mine, marks_seen = seen.panel == panel, seen.marks[panel]
     if marks_seen < MIN_MARKS:
         problem = (
-            f"shows only {marks_seen} marks of panel {panel}; check that it is sharp and shows this panel's whole chart"
+            f"shows only {marks_seen} marks of panel {panel}; check that the picture is sharp and shows the whole "
+            "chart of this panel"
         )
         raise InputError(source, "", problem)
     image_from_panel, _ = cv2.findHomography(seen.panel_px[mine], seen.image_px[mine], cv2.RANSAC, 8.0)
@@ -237,6 +238,6 @@ def measure(pictures: list[F64], stack: PanelStack, panel: int, *, source: str) 
     if falls.size:
         lower, upper = GREYS[int(falls[0])], GREYS[int(falls[0]) + 1]
         problem = f"grey {upper} is darker than grey {lower}"
-        causes = "check for a reflection, a change of exposure and a wrong LUT"
+        causes = "check for reflections, changes in exposure and a wrong LUT"
         raise InputError(source, "greys", f"{problem}; {causes}")
     return np.clip(levels, 0.0, 1.0), float(np.median(np.abs(fit.fun)))

@@ -103,7 +103,8 @@ class SetupHardware:
 
         Args:
             settings: Display configuration.
-            pictures: One grey picture per panel (N, H, W): the boards, or one panel's grey chart.
+            pictures: (N, H, W) grey pictures, one per panel: the boards, or the grey chart on one panel and nothing on
+                the others.
             panel: Index of the panel that shows the grey chart, with no grey curve applied, or None if the boards are
                 shown.
             say: Function that shows a line of text to the user.
@@ -118,7 +119,7 @@ class SetupHardware:
         self._display = open_display(settings, grey_curve=panel is None)
         try:
             self._display.show(grey_layers(pictures))
-            say(f"put {count} into {folder}, then press Enter, or q to stop")
+            say(f"put {count} into {folder} and press Enter, or press q to stop")
             while (key := self.key()) is not Key.ACCEPT:
                 if key is Key.QUIT:
                     raise InputError(

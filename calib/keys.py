@@ -93,7 +93,10 @@ class TerminalKeys:
         return None
 
     def line(self) -> str:
-        """Wait for the next line and return it without surrounding blanks. Returns `q` at end of input."""
+        """Wait for the next line and return it with leading and trailing whitespace removed.
+
+        Returns `q` at end of input.
+        """
         self.close()
         data = b""
         while self._descriptor >= 0 and (read := os.read(self._descriptor, 1)) != b"\n":

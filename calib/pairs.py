@@ -132,7 +132,9 @@ def _read_rows(path: Path) -> tuple[list[str], list[PairRow]]:
         labels, items = [label for label, _ in read], [row for _, row in read]
     missing = [name for name in COLUMNS if name not in columns]
     if missing:
-        raise InputError(path, missing[0], "the column is missing; required columns: " + ", ".join(COLUMNS))
+        raise InputError(
+            path, missing[0], "the column is missing; the file must have the columns " + ", ".join(COLUMNS)
+        )
     try:
         return labels, TypeAdapter(list[PairRow]).validate_python(items)
     except ValidationError as error:

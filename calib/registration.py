@@ -112,11 +112,11 @@ def register_photographs(seen: Sequence[SeenMarks], stack: PanelStack, *, eye_m:
         if max(unfit) <= DISAGREES:
             break
         odd = good.pop(int(np.argmax(unfit)))
-        excluded[odd.name] = "contradicts the other photographs, because it shows another stack or something has moved"
+        excluded[odd.name] = "contradicts the other photographs (it shows another stack, or something has moved)"
     _refuse_one_place(bundle)
     if bundle.sigma_px > MISFIT_PX:
         raise Undetermined(
-            f"the photographs do not show one rigid stack: points are off by {bundle.sigma_px:.1f} px on average"
+            f"the photographs do not show one rigid stack: points deviate by {bundle.sigma_px:.1f} px on average"
         )
     model = geometry_of(bundle.panels, stack, eye_m=eye_m)
     _refuse_implausible(bundle, stack)
@@ -148,7 +148,7 @@ def register_photographs(seen: Sequence[SeenMarks], stack: PanelStack, *, eye_m:
 def _other_sizes(good: Sequence[SeenMarks]) -> dict[str, str]:
     sizes = [(s.width_px, s.height_px) for s in good]
     width, height = max(sizes, key=sizes.count, default=(0, 0))
-    text = f"differs in size from the other photographs ({width}x{height}); use one camera and one setting"
+    text = f"has a different size from the other photographs ({width}x{height}); use one camera and one zoom setting"
     return {s.name: text for s, size in zip(good, sizes, strict=True) if size != (width, height)}
 
 
@@ -167,8 +167,8 @@ def _refuse_one_place(bundle: Bundle) -> None:
     span = float(np.degrees(np.arccos(np.clip((directions @ directions.T).min(), -1, 1))))
     if span < MIN_SPAN_DEG:
         raise Undetermined(
-            f"the photographs' directions span only {span:.0f} degrees, but at least {MIN_SPAN_DEG:.0f} are needed; "
-            "take photographs from the left, from the right, from above and from below"
+            f"the photographs' directions span only {span:.0f} degrees, but at least {MIN_SPAN_DEG:.0f} are "
+            "needed; take some from the left, from the right, from above and from below"
         )
 
 
@@ -180,12 +180,12 @@ def _refuse_implausible(bundle: Bundle, stack: PanelStack) -> None:
             raise Undetermined(
                 f"panel {index} is {abs(panel.axis_x_m - origin_m) * 1e3:.1f} mm from panel {bundle.reference}, but "
                 f"{abs(stack.x_m[index] - origin_m) * 1e3:.1f} mm in the configuration; check that the photographs "
-                "are of this stack and that stack.x_m, width_m and height_m are correct"
+                "show this stack and that stack.x_m, width_m and height_m are correct"
             )
         if np.abs(off[1:]).max() > IMPLAUSIBLE_M:
             raise Undetermined(
                 f"panel {index} is shifted by {np.linalg.norm(off[1:]) * 1e3:.0f} mm from panel {bundle.reference}; "
-                "check that the photographs are of this stack, or move the panel into place by hand"
+                "check that the photographs show this stack, or move the panel into place by hand"
             )
 
 
@@ -262,8 +262,8 @@ def registration_summary(registered: Registration) -> dict[str, Any]:
     notes = list(registered.notes)
     if not stack.is_evenly_spaced:
         notes.append(
-            f"the gaps differ by more than {100 * UNEVEN_MOST:.0f}%, and the networks do not "
-            "support that; use the model sart"
+            f"the gaps differ by more than {100 * UNEVEN_MOST:.0f}%, which the networks do not support; use the model "
+            "sart"
         )
     return {
         "reference": bundle.reference,

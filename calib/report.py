@@ -82,7 +82,7 @@ def write_report(file: Path, out: Path, *, viewing: CalibrationSettings) -> dict
 
 
 def _stored_points(data: Any, calibration: Calibration, *, source: Path) -> Points | None:
-    """Return the errors at the pairs in a file's `[data]` table, or None if the file contains no pairs.
+    """Return the errors of the pairs listed in a file's `[data]` table, or None if it has no pairs.
 
     Raises InputError if the table is invalid.
     """

@@ -58,7 +58,7 @@ def _best_half(sensor_m: F64, stack_m: F64, *, random: np.random.Generator) -> N
     sums = np.take_along_axis(squared, chosen, axis=-1).sum(-1)
     winner = int(np.argmin(sums))
     if not np.isfinite(sums[winner]):
-        raise Degenerate("no half of the pairs agrees on one similarity transform; check the pairs or capture new ones")
+        raise Degenerate("no similarity transform fits at least half of the pairs; check the pairs or capture new ones")
     return np.asarray(chosen[winner])
 
 

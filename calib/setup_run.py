@@ -108,7 +108,7 @@ def _is_done(setup: Setup, step: SetupStep) -> bool:
     try:
         figures = step.run(setup)
     except (SetupStopped, PhasestackError) as error:
-        stopped = "stopped without writing unfinished changes to the configuration"
+        stopped = "stopped; unfinished changes were not written to the configuration"
         setup.say(stopped if isinstance(error, SetupStopped) else f"failed: {error}")
         return False
     setup.done[step.name] = figures

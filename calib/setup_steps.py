@@ -157,7 +157,7 @@ def geometry(setup: Setup) -> Figures:
 
     rewrite(setup.config, change)
     width_mm, height_mm = (1e3 * size[name] for name in ("width_m", "height_m"))
-    return {"text": f"panels of {width_mm:.1f} by {height_mm:.1f} mm, viewers {near_m:.2f} to {far_m:.2f} m away"}
+    return {"text": f"panels of {width_mm:.1f} by {height_mm:.1f} mm, viewed from {near_m:.2f} to {far_m:.2f} m away"}
 
 
 def registration(setup: Setup) -> Figures:
@@ -259,8 +259,8 @@ def service(setup: Setup) -> Figures:
     ]
     listed = "; ".join(commands)
     if setup.hardware.simulated or sudo:
-        setup.say("the service uses copies of these files; install them with\n    " + "\n  ".join(commands))
-        return {"text": f"gathered {len(files)} files; install them with: {listed}"}
+        setup.say("the service uses copies of these files; to install them, run\n    " + "\n  ".join(commands))
+        return {"text": f"gathered {len(files)} files; to install them, run: {listed}"}
     setup.hardware.let_go()  # the service needs the panels
     for command in commands:
         result = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=False)

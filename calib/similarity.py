@@ -141,7 +141,8 @@ def fit(sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> Similarity:
         unit = _polished(unit, unit_sensor, unit_stack, rule=unit_rule)
     if not (np.isfinite(unit.scale) and unit.scale > 0):
         raise Degenerate(
-            "the sensor points and the stack points are not correlated; check that each pair belongs together"
+            "the sensor points and the stack points are not correlated; check that the points of each pair belong "
+            "together"
         )
     return Similarity(unit.scale * (stack_unit / sensor_unit), unit.rotation, unit.translation_m * stack_unit)
 
@@ -150,9 +151,9 @@ def _refuse_degenerate(name: str, points_m: F64) -> tuple[float, float]:
     first, second, _ = extents(points_m)
     magnitude = float(np.abs(points_m).max(initial=0.0))
     if first <= 4 * EPSILON * magnitude:
-        raise Degenerate(f"the {name} points coincide; use viewpoints that are apart")
+        raise Degenerate(f"the {name} points coincide; use viewpoints that are farther apart")
     if second <= 4 * EPSILON * magnitude or second <= 1e-13 * first:
-        raise Degenerate(f"the {name} points are on one line, so the rotation about that line is unknown")
+        raise Degenerate(f"the {name} points all lie on one line, so the rotation about that line is unknown")
     bound = 4 * EPSILON * magnitude / second  # verified with 50-digit arithmetic: `phasestack stability`
     if bound > ROTATION_BOUND_RAD:
         raise Degenerate(

@@ -20,7 +20,10 @@ IPD_M = 0.060  # the paper's distance between the eyes, used if the configuratio
 
 @dataclass(frozen=True, slots=True)
 class Viewpoint:
-    """Position where a calibration needs the midpoint between the eyes, in spherical coordinates."""
+    """Position at which a calibration requires the midpoint between the eyes to be placed.
+
+    The coordinates are spherical.
+    """
 
     radius_cm: int  # distance from the stack's origin
     phi_deg: int  # angle from the vertical

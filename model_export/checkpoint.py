@@ -74,7 +74,7 @@ def fill(net: nn.Module, state: Mapping[str, Tensor], *, source: str | Path, arc
         raise InputError(source, (missing or surplus)[0], "; ".join(problem))
     for key, value in state.items():
         if value.shape != expected[key].shape:
-            shapes = f"has the shape {tuple(value.shape)}, but {arch} has {tuple(expected[key].shape)}"
+            shapes = f"has shape {tuple(value.shape)}, but {arch} requires {tuple(expected[key].shape)}"
             raise InputError(source, key, shapes)
         if not torch.isfinite(value).all():
             raise InputError(source, key, "contains numbers that are not finite")

@@ -26,7 +26,8 @@ Options = Annotated[
     typer.Option(
         "--option",
         metavar="NAME=VALUE",
-        help="network option as NAME=VALUE, or steps=N for the solver steps after the network; repeat for more",
+        help="network option as NAME=VALUE, or steps=N for the number of solver steps after the network (can be "
+        "repeated)",
     ),
 ]
 
@@ -36,13 +37,14 @@ def train(
     arch: Arch,
     option: Options = None,
     data: Annotated[
-        Path | None, typer.Option(help="folder of pairs in EyeReal's format (default: procedural pairs)")
+        Path | None,
+        typer.Option(help="folder containing pairs in EyeReal's format (default: procedurally generated pairs)"),
     ] = None,
-    scene: Annotated[str, typer.Option(help="scene or file to draw, at random rotations and eye positions")] = "",
-    pairs: Annotated[int, typer.Option(min=0, help="number of different pairs; 0 for unlimited")] = 0,
+    scene: Annotated[str, typer.Option(help="scene or file to draw at random rotations and eye positions")] = "",
+    pairs: Annotated[int, typer.Option(min=0, help="number of different pairs (0 for unlimited)")] = 0,
     panels: Annotated[
         Path | None,
-        typer.Option(help="file with the geometry of the panels (default: random stacks of three)"),
+        typer.Option(help="file with the geometry of the panels (default: random stacks of three panels)"),
     ] = None,
     iterations: Annotated[int, typer.Option(min=1, help="total number of gradient steps")] = 2000,
     batch: Annotated[int, typer.Option(min=1, help="pairs per iteration")] = 1,
@@ -52,11 +54,13 @@ def train(
         int, typer.Option(min=32, max=8192, help="height of training panels and pictures in pixels")
     ] = 270,
     eye_sigma_mm: Annotated[float, number(0, 20, "mm", help="standard deviation of the tracking error in mm")] = 1.0,
-    seed: Annotated[int, typer.Option(min=0, help="seed of weights and pairs")] = 1,
-    validate_every: Annotated[int, typer.Option(min=1, help="iterations between points of the curve")] = 100,
-    device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="auto uses a GPU if torch finds one")] = "auto",
+    seed: Annotated[int, typer.Option(min=0, help="random seed for weights and pairs")] = 1,
+    validate_every: Annotated[int, typer.Option(min=1, help="number of iterations between points on the curve")] = 100,
+    device: Annotated[
+        Literal["auto", "cpu", "cuda"], typer.Option(help="device to train on (auto uses a GPU if torch finds one)")
+    ] = "auto",
     resume: Annotated[bool, typer.Option("--resume", help="continue from the checkpoint in --out")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print the result as one JSON object")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print the result as a JSON object")] = False,
 ) -> None:
     """Train a picture network by gradient descent on the light that reaches the eyes.
 
@@ -112,14 +116,16 @@ def export(
         Path | None,
         typer.Option(help="weights from `phasestack train`, or the published weights for eyereal"),
     ] = None,
-    random_init: Annotated[int | None, typer.Option(min=0, help="use untrained weights with this seed")] = None,
+    random_init: Annotated[
+        int | None, typer.Option(min=0, help="use untrained weights generated from this seed")
+    ] = None,
     width: Annotated[int, typer.Option(help="width of the panels in pixels")] = 1920,
     height: Annotated[int, typer.Option(help="height of the panels in pixels")] = 1080,
     eye_order: Annotated[
         Literal["left-right", "right-left"], typer.Option(help="for eyereal: order of the eyes in the training data")
     ] = "left-right",
     option: Options = None,
-    as_json: Annotated[bool, typer.Option("--json", help="print the checks as one JSON object")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print the checks as a JSON object")] = False,
 ) -> None:
     """Write a model and its contract to an ONNX file, provided that its results agree with torch's.
 
@@ -149,9 +155,9 @@ def export(
 
 def validate(
     file: Annotated[Path, typer.Argument(help="ONNX file to check")],
-    as_json: Annotated[bool, typer.Option("--json", help="print the checks as one JSON object")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print the checks as a JSON object")] = False,
 ) -> None:
-    """Check a model file's contract, names and shapes, and its results for extreme inputs.
+    """Check a model file's contract, names and shapes, and the results that it gives on extreme inputs.
 
     Exits with 1 if a check fails.
 

@@ -93,7 +93,7 @@ class EyeRealNet(nn.Module):
     class Options(Section):
         """The network's size."""
 
-        width: Annotated[int, Field(ge=1, le=256)] = Field(32, description="number of channels of its first layer")
+        width: Annotated[int, Field(ge=1, le=256)] = Field(32, description="number of channels in the first layer")
 
     def __init__(self, width: int = 32) -> None:
         super().__init__()

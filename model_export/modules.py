@@ -34,18 +34,20 @@ class Form(Section):
     """
 
     input_frame: Literal["centre", "panel"] = Field(
-        "centre", description="both eyes' pictures, resampled to the pixels of the centre panel or of every panel"
+        "centre",
+        description="pixels to which both eyes' pictures are resampled: those of the centre panel or of every panel",
     )
     input_value: Literal["intensity", "phase"] = "intensity"
     output: Literal["panels"] = "panels"
     branch: Literal[1, 2] = Field(1, description="branch of the phase sums: 1 for [0, 1] or 2 for [1, 2]")
     picture_fov_deg: Annotated[float, Field(ge=0, lt=180)] = Field(
         0.0,
-        description="horizontal field of view of its pictures, which are black outside; 0 for that of the content",
+        description="horizontal field of view of the input pictures, which are black outside it (0 for that of "
+        "the content)",
     )
 
     steps: Annotated[int, Field(ge=0, le=STEPS_MOST)] = Field(
-        0, description="solver steps after the network, in training and at run time"
+        0, description="number of solver steps after the network, in training and at run time"
     )
 
     @property
@@ -132,14 +134,16 @@ def probe(network: Network, *, width_px: int, height_px: int) -> None:
     with torch.no_grad(), blamed(arch, f"forward, of {tuple(example.shape)}"):
         answer = network.net.eval()(example)
     if not isinstance(answer, Tensor):
-        raise InputError(arch, "forward", f"returns {type(answer).__name__}, but must return one tensor")
+        raise InputError(
+            arch, "forward", f"returns an object of type {type(answer).__name__}, but must return a single tensor"
+        )
     shape = tuple(answer.shape)
     for axis, size, needed in zip(("batch", "channels", "height", "width"), shape, expected, strict=False):
         if size != needed or len(shape) != len(expected):
-            problem = f"returns the shape {shape} instead of {expected}; check the {axis}"
+            problem = f"returns a tensor of shape {shape} instead of {expected}; check the {axis}"
             raise InputError(arch, "forward", f"{problem} ({PANELS} panels of {COLOURS} colours)")
     if answer.dtype != torch.float32:
-        raise InputError(arch, "forward", f"returns {answer.dtype} instead of torch.float32")
+        raise InputError(arch, "forward", f"returns a tensor of type {answer.dtype} instead of torch.float32")
     if not torch.isfinite(answer).all():
         raise InputError(arch, "forward", "returns numbers that are not finite")
 

@@ -114,7 +114,7 @@ def run_training(out: Path, training: Training, *, device: Device = "auto", resu
                 loss.backward()  # type: ignore[no-untyped-call]
             if not torch.isfinite(loss):
                 raise InputError(
-                    training.arch, f"iteration {number}", "the light is not finite; lower the learning rate"
+                    training.arch, f"iteration {number}", "the measured light is not finite; lower the learning rate"
                 )
             nn.utils.clip_grad_norm_(net.parameters(), 1.0)
             optimizer.step()
@@ -270,7 +270,7 @@ def _resumed(
         out: Folder that contains the checkpoint.
         training: Settings, which must equal those in the checkpoint.
         network: Network that receives the weights.
-        *parts: Optimizer and learning rate scheduler, which receive their states.
+        *parts: Optimizer and learning rate scheduler whose states are to be restored.
 
     Returns:
         The number of completed iterations, the learning curve, and the light PSNR of every iteration since the curve's

@@ -301,10 +301,11 @@ def evaluate(
         last = given.ndim == 4 and given.shape[1] in (3, 4) and given.shape[3] not in (3, 4)
         advice = "; channels must come last, so pass np.moveaxis(layers, 1, -1)" if last else ""
         advice = "; for grey layers, pass np.stack([layers] * 3, -1)" if given.shape == wanted else advice
-        raise ValueError(f"layers: must have the shape {(*wanted, 3)}, not {given.shape}{advice}")
+        raise ValueError(f"layers: must have shape {(*wanted, 3)}, but has shape {given.shape}{advice}")
     if np.issubdtype(given.dtype, np.floating) and 1 < given.max() <= np.pi / 2:
         raise ValueError(
-            f"layers: values must be at most 1, not {given.max():g}; if they are angles in radians, divide by pi/2"
+            f"layers: values must be at most 1, but reach {given.max():g}; if they are angles in radians, divide them "
+            "by pi/2"
         )
     codes = [as_codes(as_picture(f"layers[{n}]", layer[..., :3])) for n, layer in enumerate(given)]
     return _measured(pair.judged(np.stack(codes)), how)
@@ -352,7 +353,7 @@ def camera(eye_m: Sequence[float] | F64, *, width_px: int, height_px: int, fov_d
             raise ValueError(f"{name}: is {size!r}, not a whole number of pixels")
     eye = np.asarray(eye_m, np.float64)
     if eye.shape != (3,) or not np.isfinite(eye).all() or not eye.any():
-        raise ValueError("eye_m: must be three finite numbers in metres that are not all 0")
+        raise ValueError("eye_m: must be three finite numbers (in metres), not all zero")
     return image_from_stack(eye, fov_deg=_number("fov_deg", fov_deg, *FOV_RANGE_DEG, "degrees"), **sizes)
 
 
@@ -376,7 +377,7 @@ def project(
     """
     points = np.asarray(points_m, np.float64)
     if points.ndim < 1 or points.shape[-1] != 3:
-        raise ValueError(f"points_m: must have the shape (..., 3), not {points.shape}")
+        raise ValueError(f"points_m: must have shape (..., 3), but has shape {points.shape}")
     matrix = camera(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
     seen = points @ matrix[:, :3].T + matrix[:, 3]
     depth = np.where(seen[..., 2:] > 0, seen[..., 2:], np.nan)
@@ -398,12 +399,16 @@ def _checked(
     """
     pictures = [as_picture(name, picture) for name, picture in zip(("left", "right"), given, strict=True)]
     if pictures[0].shape != pictures[1].shape:
-        raise ValueError(f"right: must have the same shape as left, {pictures[0].shape}, not {pictures[1].shape}")
+        raise ValueError(
+            f"right: must have the same shape as left ({pictures[0].shape}), but has shape {pictures[1].shape}"
+        )
     stack = checked_stack(stack)
     fov_deg = _number("fov_deg", fov_deg, *FOV_RANGE_DEG, "degrees")
     if cameras is None:
         if eyes_m is None:
-            raise ValueError("eyes_m: is required without cameras; pass the left and right eye in metres")
+            raise ValueError(
+                "eyes_m: is required without cameras; pass the positions of the left and right eyes in metres"
+            )
         eyes = _eyes(eyes_m, stack)
     else:
         try:
@@ -419,7 +424,9 @@ def _checked(
     pair = _Pair(tuple(pictures), eyes, stack, fov_deg, is_resampled=cameras is not None)
     black = np.zeros((stack.count, stack.height_px, stack.width_px, 3), np.uint8)
     if not all(seen_by(eye, black, stack, fov_deg=fov_deg, width_px=64, height_px=64).mask.any() for eye in eyes):
-        raise ValueError("eyes_m: an eye cannot see any part of the display; move the eyes in front of the panels")
+        raise ValueError(
+            "eyes_m: at least one eye cannot see any part of the display; move the eyes in front of the panels"
+        )
     return pair
 
 

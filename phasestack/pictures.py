@@ -34,7 +34,7 @@ def as_picture(name: str, given: Any) -> Picture:
     """
     picture: Any = _from_pillow(name, given) if hasattr(given, "getbands") else as_array(name, given)
     if picture.ndim != 3 or picture.shape[2] not in (3, 4) or min(picture.shape[:2]) < LEAST_PX:
-        told = f"must have the shape (h, w, 3) or (h, w, 4), with h and w at least {LEAST_PX}, not {picture.shape}"
+        told = f"shape must be (h, w, 3) or (h, w, 4), with h and w at least {LEAST_PX}, but is {picture.shape}"
         raise ValueError(f"{name}: {told}{_advice_on_shape(name, picture)}")
     if picture.dtype != np.uint8:
         if not np.issubdtype(picture.dtype, np.floating):
@@ -43,7 +43,8 @@ def as_picture(name: str, given: Any) -> Picture:
         low, high = (float(bound) for bound in (picture.min(), picture.max()))
         if not (low >= -SLACK and high <= 1 + SLACK):  # also refuses NaN
             raise ValueError(
-                f"{name}: values must be from 0 to 1, not {low:g} to {high:g}{_advice_on_range(name, low, high)}"
+                f"{name}: values must be from 0 to 1, but range from {low:g} to "
+                f"{high:g}{_advice_on_range(name, low, high)}"
             )
         picture = picture.astype(np.float32).clip(0, 1)
     if picture.shape[2] == 3:

@@ -77,7 +77,7 @@ class SensorFrame:
     colour: U8 | None = None  # (h, w, 3) RGB
     depth_mm: U16 | None = None  # (h, w), registered to the colour image where both exist; 0: no measurement
     intrinsics: Intrinsics | None = None  # intrinsics of the image that depth and colour are registered to
-    true_eyes_m: F64 | None = None  # (2, 3) true eyes in metres, frame `stack`; None: no ground truth
+    true_eyes_m: F64 | None = None  # (2, 3) true eyes in metres, in frame `stack`; None: no ground truth
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +86,7 @@ class EyesEstimate:
 
     time_ns: int  # instant that the estimate is for
     capture_ns: int  # capture time of the newest sample used; may be 0 with label `none`
-    eyes_m: F64 | None  # (2, 3) left and right eye in metres, frame `stack`; None with label `none`
+    eyes_m: F64 | None  # (2, 3) left and right eye in metres, in frame `stack`; None with label `none`
     label: EyesLabel
     sigma_m: float = 0.0  # standard deviation, along each axis, of the eyes' midpoint at `time_ns`
 
@@ -157,7 +157,7 @@ class SolveRequest:
     """A request from the presenter to the solver. It replaces any request that the solver has not begun."""
 
     time_ns: int  # instant to solve for, the middle of the solution's expected display time
-    eyes_m: F64 | None  # (2, 3) left and right eye in metres, frame `stack`, predicted for `time_ns`; None: no viewer
+    eyes_m: F64 | None  # (2, 3) left and right eye in metres, in frame `stack`, at `time_ns`; None: no viewer
     eyes_label: EyesLabel
     sigma_m: float  # standard deviation of `eyes_m` along each axis
     flat_wanted: bool  # True if the flat picture is shown or will be needed
@@ -196,7 +196,7 @@ class Solution:
 
     number: int  # counted from 1, over solutions and flat pictures together
     layers: U8  # (N, h, w, 4) RGBA layers, rear to front, on a raster that is coarser by `effort.reduction`
-    solved_for_m: F64 | None  # (2, 3) left and right eye in metres, frame `stack`; None: a flat picture
+    solved_for_m: F64 | None  # (2, 3) left and right eye in metres, in frame `stack`; None: a flat picture
     solved_for_ns: int  # instant that the eyes and the content were predicted for
     seeing: tuple[bool, bool] = (True, True)  # left, right; False: eye out of range, replaced by the other eye
     eye_sigma_m: float | None = None  # tracking error that the solution allows for
@@ -214,12 +214,12 @@ class RefreshAccount:
     capture_ns: int  # capture time of the newest sample used; 0: no sample
     predicted_for_ns: int  # display time
     present_ns: int
-    eyes_m: F64 | None  # (2, 3) eyes that the panels are aligned to, in metres, frame `stack`
+    eyes_m: F64 | None  # (2, 3) eyes that the panels are aligned to, in metres, in frame `stack`
     eyes_label: EyesLabel
     eye_sigma_mm: float | None  # standard deviation of the eyes along each axis; None: no eyes
     state: State
     solution: int | None  # number of the solution shown; None: only the flat picture
-    solved_for_m: F64 | None  # (2, 3) eyes that the solution was computed for, in metres, frame `stack`
+    solved_for_m: F64 | None  # (2, 3) eyes that the solution was computed for, in metres, in frame `stack`
     solution_age_ms: float | None  # display time minus the instant that the solution was computed for
     inference: Inference  # ran: first refresh to show the solution; reused: a later refresh; skipped: no solution
     presented: bool

@@ -163,7 +163,7 @@ def test_one_file_that_holds_both_views_is_solved_as_two(pair: Path, name: str, 
 def test_one_view_is_refused_and_so_is_a_layout_for_two_files(pair: Path) -> None:
     arguments = solve_arguments(pair)
     at = arguments.index("--right")
-    assert "left.png: layout: contains 1 view; pass --right or another --layout" in refusal(
+    assert "left.png: layout: contains 1 view; pass --right or a different --layout" in refusal(
         *arguments[:at], *arguments[at + 2 :]
     )
     assert "solve: --layout: cannot be combined with --right" in refusal(*arguments, "--layout", "side-by-side")

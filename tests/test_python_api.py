@@ -94,7 +94,7 @@ def test_pictures_are_codes_or_intensities_with_or_without_transparency() -> Non
         ({"right": picture().astype(np.float32)}, "right: .*if white is 255"),
         ({"fov_deg": "40"}, "fov_deg: must be a number of degrees, not '40'"),
         ({"model": 3}, "model: must be fast, balanced, best, sart or an ONNX file, not 3"),
-        ({"cameras": np.zeros((2, 4, 4))}, "cameras: must be a left and a right 3x4 matrix"),
+        ({"cameras": np.zeros((2, 4, 4))}, "cameras: must be two 3x4 matrices"),
         ({"cameras": np.zeros((2, 3, 4))}, "cameras: must be matrices"),
         ({"cameras": [phasestack.camera(eye, width_px=320, height_px=180) for eye in EYES[::-1]]}, "cameras: are at"),
         ({"fov_deg": 190.0}, "fov_deg"),
@@ -243,9 +243,9 @@ def test_anybody_s_layers_are_evaluated_as_ours_are() -> None:
     assert phasestack.evaluate(result.layers / 255, picture(), picture(3), **how) == result.quality
     with pytest.raises(ValueError, match=r"layers: .*channels must come last, so pass np.moveaxis\(layers, 1, -1\)"):
         phasestack.evaluate(np.moveaxis(result.layers, 3, 1), picture(), picture(3), **how)
-    with pytest.raises(ValueError, match=r"layers: must have the shape .*, not \(2, "):
+    with pytest.raises(ValueError, match=r"layers: must have shape .*, but has shape \(2, "):
         phasestack.evaluate(result.layers[:2], picture(), picture(3), **how)
-    with pytest.raises(ValueError, match=r"layers: must have the shape .*for grey layers, pass np.stack"):
+    with pytest.raises(ValueError, match=r"layers: must have shape .*for grey layers, pass np.stack"):
         phasestack.evaluate(result.layers[..., 0], picture(), picture(3), **how)
     with pytest.raises(ValueError, match=r"layers: values must be at most 1.*if they are angles in radians"):
         phasestack.evaluate(result.layers / 255 * np.pi / 2, picture(), picture(3), **how)

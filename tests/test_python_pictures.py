@@ -85,7 +85,10 @@ def test_the_advice_of_a_refusal_makes_a_picture(given: Any, advice: str) -> Non
         ([[1, 2], [3]], "must be an array of numbers, not list"),
         (np.full((20, 30, 3), "a"), "must be an array of numbers, not ndarray"),
         (None, "must be an array of numbers, not NoneType"),
-        (np.full((20, 30, 3), np.nan), "values must be from 0 to 1, not nan to nan; some values are not finite"),
+        (
+            np.full((20, 30, 3), np.nan),
+            "values must be from 0 to 1, but range from nan to nan; some values are not finite",
+        ),
         (np.zeros((4, 4, 3), np.uint8), "with h and w at least 16"),
         (CODES.astype(np.int32) - 9, "divide by the value of white"),
     ],

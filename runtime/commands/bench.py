@@ -14,7 +14,7 @@ app = typer.Typer()
 def bench(
     context: typer.Context,
     out: Annotated[Path | None, typer.Option(help="write the measurement to this JSON file")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="print the result as one JSON object")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print the result as a JSON object")] = False,
 ) -> None:
     """Measure the shipped models' run time, memory and light PSNR, or compare two measurements.
 
@@ -43,7 +43,7 @@ def bench(
 def compare(
     old: Annotated[Path, typer.Argument(help="JSON file with the earlier measurement")],
     new: Annotated[Path, typer.Argument(help="JSON file with the later measurement")],
-    as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print the comparison as a JSON object")] = False,
 ) -> None:
     """List every figure that changed by more than the noise. Exits with 1 if any figure got worse.
 
@@ -69,7 +69,7 @@ def compare(
         print(f"the reference workload took {speed:.2f} times as long as before; solution times are scaled to match")
         for change in sorted(changes, key=lambda change: not change.worse):
             print(f"{'worse ' if change.worse else 'better'} {change.what}: {change.text}")
-        again = ", but run times could not be compared; measure again on an idle machine" if busy else ""
+        again = " (run times could not be compared; measure again on an idle machine)" if busy else ""
         ends = f"{len(worse)} worse, {len(changes) - len(worse)} better"
         print(ends if changes else f"no figure changed by more than the noise{again}")
     if worse:

@@ -38,7 +38,7 @@ def scene(
 
 @app.command()
 def place(
-    scale: Annotated[float | None, number(0.001, 1000, help="scale factor of the scene")] = None,
+    scale: Annotated[float | None, number(0.001, 1000, help="factor by which to scale the scene")] = None,
     offset: Annotated[
         tuple[float, float, float] | None,
         number(-10, 10, "m", help="offset in metres (out of the screen, to the right, up)"),
@@ -50,7 +50,8 @@ def place(
         ),
     ] = None,
     turntable: Annotated[
-        float | None, number(-600, 600, help="rotation speed about the vertical axis, in turns per minute; 0 stops it")
+        float | None,
+        number(-600, 600, help="rotation speed about the vertical axis in turns per minute (0 to stop it)"),
     ] = None,
     reset: Annotated[bool, typer.Option("--reset", help="restore the configured placement")] = False,
     config: Config = None,
@@ -67,7 +68,7 @@ def place(
     value = {name: option for name, option in options.items() if option is not None}
     if reset == bool(value):
         raise InputError(
-            "ctl place", "", "pass either --reset or at least one of --scale, --offset, --rotate and --turntable"
+            "ctl place", "", "pass either --reset, or at least one of --scale, --offset, --rotate and --turntable"
         )
     tell({"command": "place", "value": None if reset else value}, config)
 
@@ -135,13 +136,13 @@ def _advised(error: Exception) -> str:
 
     advice = unit_advice()
     if not advice and any(each in str(error) for each in ("no daemon", "has died")):
-        advice = "start one with `phasestack run` or, without hardware, `phasestack try`"
+        advice = "start one with `phasestack run`, or use `phasestack try` if there is no hardware"
     return "; ".join(filter(None, (str(error), advice)))
 
 
 def status(
     config: Config = None,
-    as_json: Annotated[bool, typer.Option("--json", help="print the status as one JSON object")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print the status as a JSON object")] = False,
 ) -> None:
     """Show the daemon's state and the reason for it, rates, eye positions, uncertainty, times and faults.
 

@@ -17,9 +17,9 @@ def demo(
     out: Annotated[Path, typer.Option(help="folder for pictures, frames.jsonl and summary.json")] = Path("out/demo"),
     frames: Annotated[
         int,
-        typer.Option(min=1, help="number of refreshes to show; the whole recording has 600 and takes several minutes"),
+        typer.Option(min=1, help="number of refreshes to show (the full recording has 600 and takes several minutes)"),
     ] = FRAMES,
-    as_json: Annotated[bool, typer.Option("--json", help="print the summary as one JSON object")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print the summary as a JSON object")] = False,
 ) -> None:
     """Play a built-in recording of a moving head through the whole pipeline without a screen.
 

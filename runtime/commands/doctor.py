@@ -52,7 +52,7 @@ def doctor(
             "--service", help="check with the user, groups and configuration of the systemd service; requires root"
         ),
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print the result as one JSON object")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print the result as a JSON object")] = False,
 ) -> None:
     """Check the settings, sensor, permissions, OpenGL, monitors, scene, model, calibration and service.
 
@@ -147,7 +147,7 @@ def sensor(settings: Settings) -> Iterator[Row]:
         driver.open()
         frame = driver.read_newest(CHECK_SENSOR_FOR_S)
     except (SensorLost, SensorTimeout, EndOfRecording) as error:
-        remedy = "see docs/sensors.md" if own else "connect the sensor; see the usb rows and docs/planning.md"
+        remedy = "see docs/sensors.md" if own else "connect the sensor (see the usb rows and docs/planning.md)"
         yield Row("sensor", "fail", f"{what}: {error or 'no sample arrived'}", remedy)
         return
     finally:
@@ -212,7 +212,7 @@ def monitors(settings: Settings) -> Iterator[Row]:
         return
     from runtime.panels.display import connected_monitors
 
-    remedy = "run `phasestack identify`, which shows the name of each monitor"
+    remedy = "run `phasestack identify` to show the name of each monitor"
     try:
         there = connected_monitors()
     except PanelLost as error:
@@ -309,14 +309,16 @@ def calibration(settings: Settings) -> Iterator[Row]:
     if not settings.calibration.file:
         driver = settings.sensor.driver
         if is_plugin(driver) and plugin_class(driver, Sensor, field="sensor.driver").capabilities.in_stack_frame:
-            yield Row("calibration", "ok", "not needed because this sensor already delivers eyes in the stack's frame")
+            yield Row(
+                "calibration", "ok", "not needed because this sensor already delivers eye positions in the stack frame"
+            )
             return
         real = driver not in NO_DEVICE
         remedy = "run `phasestack calibrate capture` and `calibrate solve`, then set calibration.file" if real else ""
         yield Row(
             "calibration",
             "fail" if real else "ok",
-            "calibration.file is not set, so the demo's calibration is in use",
+            "calibration.file is not set, so the demo calibration is in use",
             remedy,
         )
         return

@@ -24,11 +24,14 @@ def eyes(
         bool, typer.Option("--sequence", help="follow the viewer from picture to picture, as the daemon does")
     ] = False,
     rate_hz: Annotated[
-        float, number(0.1, 1000, "Hz", help="frame rate of the pictures, and of films that do not state their own")
+        float, number(0.1, 1000, "Hz", help="frame rate of pictures, and of films that do not specify one")
     ] = 30.0,
-    out: Annotated[Path | None, typer.Option(help="folder for annotated copies that only you can read")] = None,
+    out: Annotated[Path | None, typer.Option(help="folder for annotated copies, which only you can read")] = None,
     as_json: Annotated[
-        bool, typer.Option("--json", help="print the result as one JSON object (watches a live sensor for two seconds)")
+        bool,
+        typer.Option(
+            "--json", help="print the result as a single JSON object (a live sensor is monitored for two seconds first)"
+        ),
     ] = False,
 ) -> None:
     """Find the viewer's pupils and how uncertain their positions are. With --out, also draw them.

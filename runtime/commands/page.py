@@ -12,11 +12,12 @@ DEFAULT_PORT = 8717
 
 def page(
     config: Annotated[Path | None, typer.Option(help="configuration file that names the daemon's socket")] = None,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="port to listen on; 0 picks a free one")] = DEFAULT_PORT,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="port to listen on (0 for any free port)")] = DEFAULT_PORT,
     token_file: Annotated[
         Path | None,
         typer.Option(
-            help="file with the login token, which is created if it does not exist (default: in the state folder)"
+            help="file that contains the login token, created if it does not exist (default: a file in the state "
+            "folder)"
         ),
     ] = None,
 ) -> None:

@@ -11,11 +11,13 @@ from runtime.support.options import blame_option, number
 
 
 def plan(
-    config: Annotated[Path | None, typer.Option(help="configuration file; `phasestack config` prints one")] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="configuration file (run `phasestack config` to print one)")
+    ] = None,
     scene: Annotated[str | None, typer.Option(help="scene to show: a built-in name, a file or a folder")] = None,
     model: Annotated[str | None, typer.Option(help="model to use: fast, balanced, best, sart or an ONNX file")] = None,
-    scale: Annotated[float, number(0.05, 2.0, help="factor applied to the panels' size in pixels")] = 1.0,
-    as_json: Annotated[bool, typer.Option("--json", help="print the result as one JSON object")] = False,
+    scale: Annotated[float, number(0.05, 2.0, help="scale factor for the pixel dimensions of the panels")] = 1.0,
+    as_json: Annotated[bool, typer.Option("--json", help="print the result as a JSON object")] = False,
 ) -> None:
     """List the work that the solver can skip for this scene, with reasons, time saved and quality lost.
 

@@ -28,23 +28,29 @@ OVER = ("ended", "failed")
 
 def record(
     out: Annotated[Path, typer.Option(help="recording to write (.mcap)")],
-    config: Annotated[Path | None, typer.Option(help="configuration file; `phasestack config` prints one")] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="configuration file (run `phasestack config` to print one)")
+    ] = None,
     images: Annotated[
         bool, typer.Option("--images", help="also record colour and depth pictures, which show people's faces")
     ] = False,
     seconds: Annotated[
-        float | None, number(0.1, RECORD_MOST_S, "s", help="length in seconds (default: 600, or 12 with --motion)")
+        float | None,
+        number(0.1, RECORD_MOST_S, "s", help="length of the recording in seconds (default: 600, or 12 with --motion)"),
     ] = None,
     motion: Annotated[
-        str | None, typer.Option(help="record a simulated head instead: still, lean, nod, walk or stop-and-go")
+        str | None,
+        typer.Option(help="record a simulated head instead of the sensor (still, lean, nod, walk or stop-and-go)"),
     ] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="seed of the head's path (only with --motion)")] = None,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="random seed for the head's path (only with --motion)")
+    ] = None,
     rate_hz: Annotated[float | None, number(15, 240, "Hz", help="samples per second (only with --motion)")] = None,
     noise_mm: Annotated[
         float | None,
-        number(0, 100, "mm", help="standard deviation of the sensor's noise per axis (only with --motion)"),
+        number(0, 100, "mm", help="standard deviation of the sensor noise on each axis (only with --motion)"),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="print the result as one JSON object")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print the result as a JSON object")] = False,
 ) -> None:
     """Record eye positions, when they were seen and, with --images, pictures. Press Ctrl-C to stop.
 
@@ -89,7 +95,7 @@ def _refuse_target(out: Path, *, motion: bool) -> None:
 
     checked_path(out, source="record", field="--out")
     if out.suffix.lower() != SUFFIX:
-        raise InputError(out, "--out", f"must end in {SUFFIX}, because recordings are MCAP files")
+        raise InputError(out, "--out", f"must end in {SUFFIX} because recordings are MCAP files")
     if os.path.isdir(out):  # noqa: PTH112 - Path.is_dir raises if a parent folder is not accessible
         raise InputError(out, "--out", "is a folder; pass the name of a file")
     if not os.path.lexists(out):

@@ -10,15 +10,13 @@ import typer
 
 def report(
     out: Annotated[Path, typer.Option(help="folder for index.html, report.json and the plots")] = Path("report"),
-    pairs: Annotated[Path | None, typer.Option(help="folder of case files with your own stereo pairs")] = None,
+    pairs: Annotated[Path | None, typer.Option(help="folder containing case files for your own stereo pairs")] = None,
     focal: Annotated[bool, typer.Option("--focal", help="also measure focal parallax through the layers")] = False,
-    model: Annotated[
-        list[str] | None, typer.Option(help="additional ONNX file to compare; repeat the option for more")
-    ] = None,
+    model: Annotated[list[str] | None, typer.Option(help="additional ONNX file to compare (can be repeated)")] = None,
     quick: Annotated[
         bool, typer.Option("--quick", help="measure only quarter-size panels and fewer reference methods")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print the result as one JSON object")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print the result as a JSON object")] = False,
 ) -> None:
     """Measure every method's light PSNR and run time on this machine, and write a page with the results.
 
@@ -59,4 +57,4 @@ def report(
             f"{result['name']:18}{size:>11}{result['ms_p50']:10.1f} ms   "
             f"light {light:6.2f} dB, one ray {result['psnr_db']:6.2f} dB {result['memory_mib']:7.0f} MiB"
         )
-    print(f"see {out / 'index.html'} (quote the light PSNR, which assumes a tracking error of 1 mm)")
+    print(f"see {out / 'index.html'} (the figure to quote is the light PSNR, which assumes a tracking error of 1 mm)")

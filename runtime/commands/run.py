@@ -13,11 +13,13 @@ from runtime.support.options import blame_option, number
 
 
 def run(
-    config: Annotated[Path | None, typer.Option(help="configuration file; `phasestack config` prints one")] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="configuration file (run `phasestack config` to print one)")
+    ] = None,
     replay: Annotated[
         str | None,
         typer.Option(
-            help="recording to play instead of reading the sensor; `demo` plays the built-in recording in a loop"
+            help="recording to play instead of reading the sensor (`demo` plays the built-in recording in a loop)"
         ),
     ] = None,
     headless: Annotated[bool, typer.Option("--headless", help="render offscreen instead of opening windows")] = False,
@@ -31,18 +33,19 @@ def run(
     out: Annotated[Path | None, typer.Option(help="folder for pictures, frames.jsonl and summary.json")] = None,
     scene: Annotated[str | None, typer.Option(help="scene to show: a built-in name, a file or a folder")] = None,
     layout: Annotated[
-        str | None, typer.Option(help="arrangement of the views in pictures, like the setting content.layout")
+        str | None,
+        typer.Option(help="arrangement of the views in the pictures (same values as the content.layout setting)"),
     ] = None,
     model: Annotated[str | None, typer.Option(help="model to use: fast, balanced, best, sart or an ONNX file")] = None,
-    scale: Annotated[float, number(0.05, 2.0, help="factor applied to the size of offscreen panels in pixels")] = 1.0,
+    scale: Annotated[float, number(0.05, 2.0, help="scale factor for the pixel dimensions of offscreen panels")] = 1.0,
     backend: Annotated[
         str | None,
-        typer.Option(help="device for everything except the network: cpu, gl or auto, which takes the faster"),
+        typer.Option(help="device for everything except the network: cpu, gl or auto (the faster of the two)"),
     ] = None,
     keep_light: Annotated[
-        int, typer.Option(min=0, help="write the layers to the --out folder every N refreshes; 0 for never")
+        int, typer.Option(min=0, help="write the layers to the --out folder every N refreshes (0 for never)")
     ] = 0,
-    as_json: Annotated[bool, typer.Option("--json", help="print the summary as one JSON object")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print the summary as a JSON object")] = False,
 ) -> None:
     """Run the display until SIGTERM. SIGHUP reloads the configuration.
 

@@ -10,15 +10,15 @@ import typer
 
 def setup(
     config: Annotated[
-        Path, typer.Option(help="configuration file to create or change; setup backs up the old file")
+        Path, typer.Option(help="configuration file to create or change (an existing file is backed up)")
     ] = Path("phasestack.toml"),
     out: Annotated[Path, typer.Option(help="folder for point pairs, the calibration, reports and setup.json")] = Path(
         "setup"
     ),
-    photos: Annotated[Path, typer.Option(help="folder with your photographs of the panels")] = Path("photos"),
+    photos: Annotated[Path, typer.Option(help="folder containing your photographs of the panels")] = Path("photos"),
     simulate: Annotated[bool, typer.Option("--simulate", help="try the setup on a simulated display")] = False,
-    seed: Annotated[int, typer.Option(min=0, help="seed of the simulated display")] = 0,
-    as_json: Annotated[bool, typer.Option("--json", help="print the result as one JSON object at the end")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="random seed for the simulated display")] = 0,
+    as_json: Annotated[bool, typer.Option("--json", help="print the result as a JSON object at the end")] = False,
 ) -> None:
     """Set up a display: monitors, sizes, panel registration, grey curves and sensor calibration.
 

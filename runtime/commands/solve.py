@@ -13,25 +13,27 @@ from runtime.support.ranges import FOV_RANGE_DEG
 
 def solve(
     left: Annotated[
-        Path, typer.Option(help="picture from a pinhole camera at the left eye, aimed at the stack's origin")
+        Path, typer.Option(help="picture taken by a pinhole camera at the left eye, aimed at the stack's origin")
     ],
-    panels: Annotated[Path, typer.Option(help="stack geometry: a TOML or JSON file with width_m, height_m and x_m")],
+    panels: Annotated[Path, typer.Option(help="TOML or JSON file with the stack geometry (width_m, height_m and x_m)")],
     out: Annotated[Path, typer.Option(help="folder to write the layers to")],
     right: Annotated[
-        Path | None, typer.Option(help="picture for the right eye; omit this option if --left contains both views")
+        Path | None, typer.Option(help="picture for the right eye (omit this option if --left contains both views)")
     ] = None,
     layout: Annotated[
-        str | None, typer.Option(help="arrangement of the views in --left, like the setting content.layout")
+        str | None, typer.Option(help="arrangement of the views in --left (same values as the content.layout setting)")
     ] = None,
-    left_eye: Annotated[tuple[float, float, float] | None, place(help="left eye in the stack frame, in metres")] = None,
+    left_eye: Annotated[
+        tuple[float, float, float] | None, place(help="position of the left eye in the stack frame, in metres")
+    ] = None,
     right_eye: Annotated[
-        tuple[float, float, float] | None, place(help="right eye in the stack frame, in metres")
+        tuple[float, float, float] | None, place(help="position of the right eye in the stack frame, in metres")
     ] = None,
     camera: Annotated[
         Path | None,
         typer.Option(
-            help="for cameras aimed elsewhere, instead of eyes and --fov: TOML or JSON file with 3x4 matrices `left` "
-            "and `right` that map metres in the stack frame to pixels"
+            help="for cameras aimed elsewhere: TOML or JSON file with 3x4 matrices `left` and `right` that map metres "
+            "in the stack frame to pixels (replaces --left-eye, --right-eye and --fov)"
         ),
     ] = None,
     fov: Annotated[
@@ -40,16 +42,16 @@ def solve(
     model: Annotated[str, typer.Option(help="model to use: fast, balanced, best, sart or an ONNX file")] = "balanced",
     repeat: Annotated[int, typer.Option(min=1, max=10000, help="number of timed runs after the warm-up")] = 1,
     eye_sigma_mm: Annotated[
-        float, number(0, 1000, "mm", help="expected tracking error per axis in mm (about 1 for a good tracker)")
+        float, number(0, 1000, "mm", help="expected tracking error on each axis in mm (about 1 for a good tracker)")
     ] = 1.0,
     backend: Annotated[
         str | None,
         typer.Option(
-            help="device for everything except the network: cpu, gl or auto, which times both if --repeat >= 10"
+            help="device for everything except the network: cpu, gl or auto (times both if --repeat is at least 10)"
         ),
     ] = None,
     no_plan: Annotated[
-        bool, typer.Option("--no-plan", help="solve every pixel, even where the pictures make it unnecessary")
+        bool, typer.Option("--no-plan", help="solve every pixel, even where this is unnecessary")
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print the contents of solve.json")] = False,
 ) -> None:
@@ -75,5 +77,5 @@ def solve(
         )
     typer.echo(shown(result, as_json=as_json))
     if not as_json:
-        typer.echo("quote light_db, which assumes a tracking error of 1 mm")
+        typer.echo("the figure to quote is light_db, which assumes a tracking error of 1 mm")
         typer.echo(f"see {out / 'contact-sheet.png'}, or open {out / 'viewer.html'} to look around")

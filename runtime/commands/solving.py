@@ -191,7 +191,7 @@ def taken(pictures: list[Any], eyes: Eyes, stack: PanelStack) -> tuple[list[Any]
     if eyes.cameras is None:
         if eyes.left is None or eyes.right is None:
             raise InputError(
-                "solve", "--left-eye, --right-eye", "are required without --camera; give both positions in metres"
+                "solve", "--left-eye, --right-eye", "are required without --camera; pass both positions in metres"
             )
         return pictures, checked_eyes(eyes.left, eyes.right, stack), eyes.fov_deg
     if eyes.left is not None or eyes.right is not None:
@@ -220,5 +220,7 @@ def checked_eyes(left_eye: tuple[float, ...], right_eye: tuple[float, ...], stac
             )
     separation_m = math.dist(left_eye, right_eye)
     if separation_m < SEPARATION_MIN_M:
-        raise InputError("solve", "--right-eye", f"is {separation_m * 1e3:g} mm from the left eye; the minimum is 5 mm")
+        raise InputError(
+            "solve", "--right-eye", f"is {separation_m * 1e3:g} mm from the left eye, but the minimum is 5 mm"
+        )
     return np.array([left_eye, right_eye])

@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 def stability(
     out: Annotated[Path | None, typer.Option(help="folder to write stability.json to")] = None,
     full: Annotated[bool, typer.Option("--full", help="also run the long cases, which take minutes")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print the result as one JSON object")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print the result as a JSON object")] = False,
     record: Annotated[
         Path | None,
-        typer.Option(help="save the measured errors as new limits in this file; use this after you change a model"),
+        typer.Option(help="file to save the measured errors to as new limits (use this after changing a model)"),
     ] = None,
 ) -> None:
     """Run every numerical method on stiff and extreme cases and compare the results with references.

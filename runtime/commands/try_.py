@@ -16,11 +16,12 @@ def try_(
     ] = None,
     scene: Annotated[str | None, typer.Option(help="scene to show: a built-in name, a file or a folder")] = None,
     layout: Annotated[
-        str | None, typer.Option(help="arrangement of the views in pictures, like the setting content.layout")
+        str | None,
+        typer.Option(help="arrangement of the views in the pictures (same values as the content.layout setting)"),
     ] = None,
     model: Annotated[str | None, typer.Option(help="model to use: fast, balanced, best, sart or an ONNX file")] = None,
-    webcam: Annotated[bool, typer.Option("--webcam", help="track your head with a webcam of this PC")] = False,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="port to listen on; 0 picks a free one")] = 0,
+    webcam: Annotated[bool, typer.Option("--webcam", help="track your head with this PC's webcam")] = False,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="port to listen on (0 for any free port)")] = 0,
     no_browser: Annotated[
         bool, typer.Option("--no-browser", help="print the address without opening a browser")
     ] = False,

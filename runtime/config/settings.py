@@ -42,27 +42,27 @@ class StackGeometry(Section):
     )
     x_m: Annotated[
         tuple[Annotated[float, within(-10.0, 10.0, "m")], ...], Field(min_length=2, max_length=PANELS_MOST)
-    ] = Field((-0.06, 0.0, 0.06), description="positions of the panels along +x in metres, from rear to front")
+    ] = Field((-0.06, 0.0, 0.06), description="x coordinates of the panels in metres, from rear to front")
     width_px: Annotated[int, Field(ge=16, le=16384)] = Field(1920, description="width of each panel in pixels")
     height_px: Annotated[int, Field(ge=16, le=16384)] = Field(1080, description="height of each panel in pixels")
     pixel_aspect: Annotated[float, within(0.1, 10.0, "")] = Field(
-        1.0, description="width of a pixel divided by its height; must agree with the sizes above to within 3%"
+        1.0, description="pixel width divided by pixel height (must match the sizes above to within 3%)"
     )
 
     tilt: Annotated[tuple[tuple[Slope, Slope], ...], Field(max_length=PANELS_MOST)] = Field(
         (),
-        description="slope of x on each panel towards the viewer's right and upwards, as measured by "
-        "`calibrate panels`; leave empty if the panels are parallel",
+        description="tilt of each panel, given as the slope of x to the viewer's right and upwards, as measured by "
+        "`calibrate panels` (leave empty if the panels are parallel)",
     )
     registered_from_m: Point = Field(
         (0.5, 0.0, 0.0),
-        description="eye position in the stack frame from which the registered panels look parallel",
+        description="eye position (in the stack frame) from which the registered panels look parallel",
     )
 
     @model_validator(mode="after")
     def _tilted(self) -> StackGeometry:
         if len(self.tilt) not in (0, len(self.x_m)):
-            raise ValueError(f"tilt: must have {len(self.x_m)} entries, one per panel, but has {len(self.tilt)}")
+            raise ValueError(f"tilt: must have {len(self.x_m)} entries (one per panel), but has {len(self.tilt)}")
         if any(any(slopes) for slopes in self.tilt) and self.registered_from_m[0] <= self.x_m[-1]:
             raise ValueError("registered_from_m: must be in front of the front panel")
         return self
@@ -73,7 +73,7 @@ class StackGeometry(Section):
         if any(gap <= 0 for gap in gaps):
             raise ValueError("x_m: must increase from rear to front")
         if min(gaps) < LEAST_GAP_M:
-            raise ValueError(f"x_m: two panels are {min(gaps):g} m apart; the minimum is {LEAST_GAP_M:g} m")
+            raise ValueError(f"x_m: two panels are only {min(gaps):g} m apart, but the minimum is {LEAST_GAP_M:g} m")
         return self
 
     def check_pixels(self) -> None:
@@ -82,9 +82,9 @@ class StackGeometry(Section):
         if abs(aspect / self.pixel_aspect - 1) > PIXEL_ASPECT_TOLERANCE:
             square_m = self.width_m / self.width_px * self.height_px / self.pixel_aspect
             raise ValueError(
-                f"stack.height_m: {self.width_px} x {self.height_px} pixels on {self.width_m:g} x {self.height_m:g} m "
-                f"have a pixel aspect of {aspect:.3g}, but stack.pixel_aspect is {self.pixel_aspect:g}; "
-                f"did you mean height_m = {square_m:.4g}? Otherwise change stack.pixel_aspect"
+                f"stack.height_m: {self.width_px} x {self.height_px} pixels on a panel of {self.width_m:g} x "
+                f"{self.height_m:g} m give a pixel aspect of {aspect:.3g}, but stack.pixel_aspect is "
+                f"{self.pixel_aspect:g}; did you mean height_m = {square_m:.4g}? Otherwise change stack.pixel_aspect"
             )
 
     def stack(self) -> PanelStack:
@@ -99,27 +99,28 @@ class SensorSettings(Section):
     """The sensor, which delivers eye positions or images."""
 
     driver: str = Field(
-        "replay", description="replay, openni2, realsense, usb-camera, fixed, or your own class as `module:Class`"
+        "replay", description="replay, openni2, realsense, usb-camera, fixed, or `module:Class` for your own class"
     )
     source: str = Field(
         "demo", description="recording, serial number or device URI to open, or `demo` for the built-in recording"
     )
     timeout_s: Annotated[float, within(0.001, 600.0, "s")] = Field(
-        0.5, description="time to wait for a sample before the sensor counts as stalled"
+        0.5, description="time to wait for a sample before treating the sensor as stalled"
     )
     loop: bool = Field(False, description="for the driver `replay`: restart the recording when it ends")
     openni2_folder: PathText = Field(
         "",
-        description="for the driver `openni2`: folder with libOpenNI2.so and OpenNI2/Drivers; empty for the system's",
+        description="for the driver `openni2`: folder that contains libOpenNI2.so and OpenNI2/Drivers (empty for "
+        "the system's)",
     )
     fov_deg: Annotated[float, Field(ge=0, lt=180)] = Field(
-        0.0, description="horizontal field of view of a camera that does not report one, such as a webcam; 0 if unknown"
+        0.0, description="horizontal field of view for cameras that do not report one, such as webcams (0 if unknown)"
     )
     fixed_eyes_m: tuple[Point, Point] | None = Field(
-        None, description="for the driver `fixed`: positions of the left and right eye in the stack frame"
+        None, description="for the driver `fixed`: positions of the left and right eyes in the stack frame"
     )
     options: dict[str, Any] = Field(
-        default_factory=dict, description="options for your own driver; its `Options` class validates them"
+        default_factory=dict, description="options for your own driver, validated by its `Options` class"
     )
 
     @field_validator("source")
@@ -136,41 +137,46 @@ class TrackerSettings(Section):
 
     hold_s: Annotated[float, within(0.0, 60.0, "s")] = Field(
         0.5,
-        description="time to keep the last eye positions after losing the viewer, before showing the flat picture",
+        description="time to keep using the last eye positions after the viewer is lost before switching to the "
+        "flat picture",
     )
     noise_m: Annotated[float, within(1e-6, 0.2, "m")] = Field(
-        0.003, description="standard deviation per axis of a measured eye position, for sensors that do not report it"
+        0.003,
+        description="standard deviation of measured eye positions on each axis, for sensors that do not report it",
     )
 
 
 class CalibrationSettings(Section):
-    """Calibration that maps the sensor frame to the stack frame, and the viewing range."""
+    """The viewing range, and the calibration that maps the sensor frame to the stack frame."""
 
     file: PathText = Field(
-        "", description="calibration file (TOML); leave empty to use the demo recording's calibration"
+        "", description="calibration file in TOML format (leave empty to use the demo recording's calibration)"
     )
     ipd_m: Annotated[float, within(0.04, 0.08, "m", zero=True)] = Field(
-        0.0, description="viewer's eye separation, for calibration charts and cameras without depth; 0 if unknown"
+        0.0,
+        description="distance between the viewer's eyes, used for calibration charts and cameras without "
+        "depth (0 if unknown)",
     )
     viewing_m: tuple[Annotated[float, within(0.05, 20.0, "m")], Annotated[float, within(0.05, 20.0, "m")]] = Field(
         (0.4, 0.6),
-        description="distances of the nearest and the farthest viewer, for calibration charts and registration",
+        description="distances to the nearest and farthest viewers, used for calibration charts and registration",
     )
     viewing_side_deg: Annotated[float, Field(ge=2, le=40)] = Field(
-        10.0, description="largest horizontal angle of a viewer to either side, measured at the display's centre"
+        10.0, description="maximum horizontal viewing angle to either side, measured at the display's centre"
     )
     viewing_up_deg: tuple[float, float] = Field(
-        (0.0, 20.0), description="lowest and highest elevation angle of the viewers' eyes"
+        (0.0, 20.0), description="lowest and highest elevation angles of the viewers' eyes"
     )
 
     @model_validator(mode="after")
     def _viewing(self) -> CalibrationSettings:
         if self.viewing_m[1] < self.viewing_m[0] * 1.1:
-            raise ValueError("viewing_m: must be two distances, the nearest first, which differ by at least 10%")
+            raise ValueError("viewing_m: must be two distances that differ by at least 10%, the nearer first")
         low, high = self.viewing_up_deg
         if not (-40 <= low < high <= 40 and high - low >= 2):
             raise ValueError(
-                "viewing_up_deg: must be two angles from -40 to 40 degrees, at least 2 degrees apart, the lower first"
+                "viewing_up_deg: must be two angles between -40 and 40 degrees that are at least 2 degrees apart, the "
+                "lower first"
             )
         return self
 
@@ -184,27 +190,32 @@ class ContentSettings(Section):
     """The content and its placement."""
 
     scene: NameOrPath = Field(
-        "demo", description="a built-in scene, a preset, a file, a folder, or your own class as `module:Class`"
+        "demo", description="a built-in scene, a preset, a file, a folder, or `module:Class` for your own class"
     )
     options: dict[str, Any] = Field(
-        default_factory=dict, description="options for a scene that is a class; the scene `program` accepts `port`"
+        default_factory=dict, description="options for a scene given as a class (the scene `program` accepts `port`)"
     )
     fov_deg: Annotated[float, within(*FOV_RANGE_DEG, "degrees")] = Field(
-        40.0, description="horizontal field of view of the eyes' images"
+        40.0, description="horizontal field of view of each eye's picture"
     )
     background: tuple[Unit, Unit, Unit] | None = Field(
-        None, description="RGB colour behind the scene, 0 to 1 each; the default is dark, or white for built-in scenes"
+        None,
+        description="background colour as RGB values from 0 to 1 (default: white for built-in scenes, dark "
+        "for all others)",
     )
-    file: PathText = Field("", description="data for a preset: a .ply file, a .glb file or the folder of a data set")
+    file: PathText = Field("", description="data for a preset: a .ply file, a .glb file or a data-set folder")
     layout: Annotated[str, Field(pattern=LAYOUT)] = Field(
         "auto",
         description="arrangement of the views: mono, [half-]side-by-side, [half-]top-bottom, [half-]cross-eyed (right "
-        "view on the left), anaglyph, rgbd or a quilt such as qs8x6a0.75; auto goes by the file name",
+        "view on the left), anaglyph, rgbd or a quilt such as qs8x6a0.75; auto detects it from the file's metadata or "
+        "name",
     )
-    cone_deg: Annotated[float, Field(gt=0, lt=180)] = Field(40.0, description="angle between a quilt's outermost views")
+    cone_deg: Annotated[float, Field(gt=0, lt=180)] = Field(
+        40.0, description="angle between the outermost views of a quilt"
+    )
     depth_m: tuple[Annotated[float, within(-10.0, 10.0, "m")], Annotated[float, within(-10.0, 10.0, "m")]] = Field(
         (-0.05, 0.05),
-        description="depth range (rear, front) of an RGBD picture; `fit` scales meshes to at most twice this depth",
+        description="rear and front limits of an RGBD picture's depth; `fit` scales meshes to at most twice this range",
     )
     picture_rate_hz: Annotated[float, within(0.01, 1000.0, "Hz")] = Field(
         30.0, description="frame rate of a folder of pictures"
@@ -214,23 +225,25 @@ class ContentSettings(Section):
     )
     axes: Annotated[str, Field(pattern=r"^(auto|[+-][xyz] [+-][xyz])$")] = Field(
         "auto",
-        description="axes of a mesh or splat that point up and towards the viewer, such as `+z -y`; "
-        "auto follows glTF's convention and guesses from the extent of other files",
+        description="axes of a mesh or splat that point up and towards the viewer, such as `+z -y`; auto follows the "
+        "file format's convention or, if there is none, guesses from the model's extent",
     )
     library: PathText = Field("", description="folder of pictures, films, models and playlists to offer on the page")
     scale: Annotated[float, within(0.001, 1000.0, "")] = Field(
-        1.0, description="scale factor of the scene about the display's centre"
+        1.0, description="factor by which to scale the scene about the display's centre"
     )
     offset_m: tuple[Offset, Offset, Offset] = Field(
-        (0.0, 0.0, 0.0), description="offset of the scene in metres: out of the screen, to the right, up"
+        (0.0, 0.0, 0.0), description="offset of the scene in metres (out of the screen, to the right, up)"
     )
     rotation_deg: tuple[Turn, Turn, Turn] = Field(
         (0.0, 0.0, 0.0),
-        description="rotations of the scene about the axes out of the screen, right and up, applied in this order",
+        description="rotations of the scene about the axes that point out of the screen, right and up, applied in "
+        "that order",
     )
     turntable_per_min: Annotated[float, within(-600.0, 600.0, "turns per minute")] = Field(
         0.0,
-        description="rotation speed about the vertical axis in turns per minute; negative is clockwise seen from above",
+        description="rotation speed about the vertical axis in turns per minute (negative for clockwise as seen "
+        "from above)",
     )
 
     @model_validator(mode="after")
@@ -255,28 +268,29 @@ class ModelSettings(Section):
     )
     effort: Literal["auto", "full"] = Field(
         "auto",
-        description="resolution and number of steps of each solution: auto adapts both to the viewer's movement; full "
-        "always uses the panels' resolution and all of the model's steps",
+        description="resolution and number of steps per solution: auto adapts both to the viewer's movement, and full "
+        "always uses the panels' full resolution and all of the model's steps",
     )
     provider: Literal["cpu", "cuda", "tensorrt", "openvino"] = Field(
         "cpu", description="ONNX Runtime execution provider for the network"
     )
     backend: Annotated[Literal["auto", "cpu", "gl"], BeforeValidator(_accept_legacy_backend)] = Field(
         "auto",
-        description="device for everything except the network: cpu, gl (the GPU through OpenGL) "
-        "or auto, which measures both at the start and takes the faster",
+        description="device for everything except the network: cpu, gl (the GPU through OpenGL) or auto for the "
+        "faster of the two, as measured at startup",
     )
     threads: Annotated[int, Field(ge=0, le=256)] = Field(
-        2, description="number of inference threads; 0 starts one per core"
+        2, description="number of inference threads (0 for one per core)"
     )
     eye_sigma_mm: Literal["auto"] | NonNegative = Field(
         "auto",
-        description="tracking error that solutions allow for: standard deviation of both eyes' common position "
-        "in mm per axis, 0 for none, or auto for what the tracker reports",
+        description="tracking error that solutions allow for, as the standard deviation in mm on each axis of the "
+        "error that both eyes share (0 for none, auto for the tracker's own estimate)",
     )
     budget_ms: NonNegative = Field(
         0.0,
-        description="time, including drawing, after which a solution starts no further step; 0 sets no limit",
+        description="time limit per solution, including drawing; no new step is started once it has elapsed (0 "
+        "for no limit)",
     )
 
 
@@ -285,7 +299,7 @@ class PanelSettings(Section):
 
     edid_serial: str = Field("", description="EDID serial number of the panel's monitor")
     connector: str = Field(
-        "", description="connector of the monitor, such as HDMI-1; if edid_serial is also set, both must match"
+        "", description="connector of the monitor, such as HDMI-1 (if edid_serial is also set, both must match)"
     )
     rotation_deg: Literal[0, 90, 180, 270] = Field(0, description="counter-clockwise rotation of the panel as mounted")
     mirror: Literal["none", "horizontal", "vertical"] = Field(
@@ -293,13 +307,13 @@ class PanelSettings(Section):
     )
     homography: tuple[tuple[Entry, Entry, Entry], tuple[Entry, Entry, Entry], tuple[Entry, Entry, Entry]] = Field(
         ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
-        description="3x3 matrix from ideal to actual panel pixels, from `calibrate panels`",
+        description="3x3 matrix that maps ideal to actual panel pixels, as measured by `calibrate panels`",
     )
     lut: PathText = Field(
-        "", description="CSV file of phase (0-1) and grey (0-1) per channel; leave empty to use `gamma`"
+        "", description="CSV file that maps phase (0-1) to grey (0-1) for each channel (leave empty to use `gamma`)"
     )
     gamma: Annotated[float, within(0.1, 10.0, "")] = Field(
-        1.0, description="used without a LUT: grey = phase^(1/gamma)"
+        1.0, description="exponent of the grey curve if there is no LUT: grey = phase^(1/gamma)"
     )
 
 
@@ -328,13 +342,14 @@ class LoopSettings(Section):
     """Pacing of the display loop, and the simulated clock."""
 
     rate_hz: Annotated[float, within(1.0, 1000.0, "Hz")] = Field(
-        60.0, description="refreshes per second of a display that does not report its rate"
+        60.0, description="refresh rate to assume for a display that does not report one"
     )
     sensor_latency_ms: Annotated[float, within(0.0, 10_000.0, "ms")] = Field(
-        15.0, description="delay from capture to arrival of a replayed sample"
+        15.0, description="delay between the capture of a replayed sample and its arrival"
     )
     scanout_ms: Annotated[float, within(0.0, 1000.0, "ms")] = Field(
-        8.0, description="delay from the buffer swap to the middle of the time when the panels show the frame"
+        8.0,
+        description="delay from the buffer swap to the midpoint of the interval during which the panels show the frame",
     )
     simulated_stage_ms: Annotated[dict[str, NonNegative], AfterValidator(_check_stages)] = Field(
         default_factory=lambda: {
@@ -351,7 +366,8 @@ class LoopSettings(Section):
     )
     evaluate_every: Annotated[int, Field(ge=0)] = Field(
         20,
-        description="with --out: measure quality every N refreshes, less often in real time; 0 for only the last one",
+        description="with --out: measure quality every N refreshes (less often if needed to keep up in real time); 0 "
+        "measures only the last refresh",
     )
 
 
@@ -360,7 +376,7 @@ class PlanSettings(Section):
 
     enabled: bool = Field(
         True,
-        description="skip work that the scene or a resting head makes unnecessary",
+        description="skip work that is unnecessary for the scene or while the head is at rest",
     )
     align: bool = Field(True, description="shift and scale the panels' pictures at every refresh to follow the eyes")
 
@@ -370,7 +386,7 @@ class ServiceSettings(Section):
 
     socket: PathText = Field("/run/phasestack/status.sock", description="path of the status and control socket")
     blackbox_minutes: Annotated[float, within(0.0, 60.0, "min")] = Field(
-        2.0, description="minutes of history that the black box keeps in memory; 0 turns it off"
+        2.0, description="minutes of history that the black box keeps in memory (0 to turn it off)"
     )
 
 
@@ -394,6 +410,6 @@ class Settings(Section):
         tables, panels = len(self.output.panels), len(self.stack.x_m)
         if tables not in (0, panels):
             raise ValueError(
-                f"output.panels: must have {panels} tables, one per panel from rear to front, but has {tables}"
+                f"output.panels: must have {panels} tables (one per panel, from rear to front), but has {tables}"
             )
         return self

@@ -74,7 +74,7 @@ def _spz(path: Path) -> Gaussians:
     else:
         blocks = _zstd_blocks(data, table, sizes)
     if [len(block) for block in blocks] != sizes:
-        raise InputError(path, "", f"is truncated: the header declares {count:,} splats")
+        raise InputError(path, "", f"is truncated; the header declares {count:,} splats")
     places, alphas, colours, scales, turns, higher = (np.frombuffer(block, np.uint8) for block in blocks)
     flat = np.asarray((colours.reshape(count, 1, 3) / np.float32(255) - np.float32(0.5)) / SPZ_COLOUR, np.float32)
     return drawable(

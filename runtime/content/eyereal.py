@@ -42,7 +42,7 @@ class Pair:
 
 
 def is_data_set(folder: Path) -> bool:
-    """Return True if a folder contains a picture named as in the data set."""
+    """Return True if a folder contains a picture whose name follows the data set's naming scheme."""
     return folder.is_dir() and any(NAME.match(path.name) for path in folder.iterdir())
 
 
@@ -68,11 +68,11 @@ def read_folder(folder: Path, preset: str) -> tuple[Pair, ...]:
             continue
         eye = (stack_from_scene @ [float(match[2]), float(match[3]), float(match[4]), 1.0])[:3]
         if eye[0] <= 0:
-            problem = f"places the eye behind the display (x = {eye[0]:.3f} m) with the preset {preset}"
+            problem = f"places the eye behind the display (x = {eye[0]:.3f} m) in preset {preset}"
             raise InputError(path, "name", problem)
         files.setdefault(int(match[1]), []).append((match[5].lower(), path, eye))
     if not files:
-        raise InputError(folder, "", "contains no pictures named like pair0_x.._y.._z.._0.jpg")
+        raise InputError(folder, "", "contains no pictures with names such as pair0_x.._y.._z.._0.jpg")
     pairs = []
     for number, halves in sorted(files.items()):
         names = [half for half, _, _ in halves]
@@ -82,10 +82,12 @@ def read_folder(folder: Path, preset: str) -> tuple[Pair, ...]:
         (name, left, left_eye), (_, right, right_eye) = sorted(halves, key=lambda half: half[2][1])
         if left_eye[1] == right_eye[1]:
             raise InputError(
-                left, f"pair{number}", "both eyes have the same y, so the left eye cannot be told from the right eye"
+                left, f"pair{number}", "both eyes have the same y coordinate, so left and right cannot be distinguished"
             )
         if name == "right":
-            raise InputError(right, f"pair{number}", f"_left is to the right of _right with the preset {preset}")
+            raise InputError(
+                right, f"pair{number}", f"the _left viewpoint lies to the right of the _right one in preset {preset}"
+            )
         pairs.append(Pair(number, (left, right), np.array([left_eye, right_eye]), stack_from_scene[:3, 3]))
     return tuple(pairs)
 
@@ -100,7 +102,9 @@ def prepare(file: SceneFile) -> Callable[..., ContentSource]:
     name = file.preset or next((name for name in preset_names() if name in path.resolve().name), "")
     if not name:
         raise InputError(
-            path, "name", "contains no preset's name; set content.scene to a preset and content.file to this folder"
+            path,
+            "name",
+            "does not contain the name of a preset; set content.scene to a preset and content.file to this folder",
         )
     pairs = read_folder(path, name)
     background = settings.background or WHITE

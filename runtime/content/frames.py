@@ -56,7 +56,7 @@ class Frames(ABC):
 
     @abstractmethod
     def frame(self, index: int) -> U8:
-        """Return an RGB picture (h, w, 3) that contains all views of its layout.
+        """Return the frame at `index` as an RGB picture (h, w, 3) containing every view in the layout.
 
         Raises ContentFailure if the picture cannot be decoded.
         """
@@ -252,7 +252,7 @@ def _why_none(folder: Path) -> str:
     message = "the folder contains no pictures"
     for inner in sorted(item for item in folder.iterdir() if item.is_dir()):
         if any(item.suffix.lower() in PICTURES for item in inner.iterdir()):
-            return f"{message}; to show the pictures in {inner.name}, name that folder instead"
+            return f"{message}; to show the pictures in {inner.name}, pass that folder instead"
     return message
 
 
@@ -269,7 +269,7 @@ def read_pair(path: Path, settings: ContentSettings) -> list[U8]:
     views = layout.views(views[0])
     if len(views) != 2:
         raise InputError(
-            path, "layout", f"contains {len(views)} view{'s' * (len(views) > 1)}; pass --right or another --layout"
+            path, "layout", f"contains {len(views)} view{'s' * (len(views) > 1)}; pass --right or a different --layout"
         )
     height, width = views[0].shape[:2]
     aspect = layout.pixel_aspect(width_px=width, height_px=height)

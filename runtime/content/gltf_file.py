@@ -109,7 +109,7 @@ class GltfFile:
         data, stride = self.view(accessor["bufferView"])
         stride, first = stride or size, accessor.get("byteOffset", 0)
         if not (first >= 0 and dtype.itemsize <= stride) or (count and first + stride * (count - 1) + size > len(data)):
-            raise ValueError("an accessor reaches beyond its buffer view")
+            raise ValueError("an accessor extends beyond its buffer view")
         if not count:
             return np.zeros((0, *shape), dtype)
         return np.ndarray((count, *shape), dtype, data, first, (stride, *strides))
@@ -120,7 +120,7 @@ class GltfFile:
         number, first, size = view["buffer"], view.get("byteOffset", 0), view["byteLength"]
         buffer = self._buffer(number)
         if not (0 <= first <= first + size <= len(buffer)):
-            raise ValueError(f"bufferViews[{index}] reaches beyond its buffer")
+            raise ValueError(f"bufferViews[{index}] extends beyond its buffer")
         return memoryview(buffer)[first : first + size], view.get("byteStride", 0)
 
     def _buffer(self, number: int) -> bytes:
@@ -148,7 +148,7 @@ class GltfFile:
         try:
             return base64.b64decode(coded)
         except binascii.Error as error:
-            raise ValueError(f"a data URI is not base64: {error}") from None
+            raise ValueError(f"a data URI is not valid base64: {error}") from None
 
     def picture(self, texture: Table) -> U8:
         """Return a texture's picture as an RGBA array (h, w, 4).

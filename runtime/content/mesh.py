@@ -142,7 +142,9 @@ def _file_of(uri: str, *, source: Path, field: str) -> Path:
     """
     shown = untrusted_input.shown(uri, most=200)
     if "://" in uri or uri.startswith("data:"):
-        raise InputError(source, field, f"{shown} is not a path; only files in this file's folder or below it are read")
+        raise InputError(
+            source, field, f"{shown} is not a local file; only files in this file's folder or below it are read"
+        )
     name = untrusted_input.path_within_folder(unquote(uri), source=source, field=field)
     if not (source.parent / name).exists():
         raise InputError(source, field, f"{shown} does not exist")

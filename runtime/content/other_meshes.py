@@ -114,7 +114,7 @@ def read_mesh(path: Path, data: bytes, read: Read) -> tuple[list[Part], list[tup
         if resolver.refused is not None:
             raise resolver.refused from None
         why = (
-            "a face names a vertex that does not exist"
+            "a face refers to a vertex that does not exist"
             if isinstance(error, IndexError)
             else "the file is damaged or is not a mesh"
         )

@@ -33,7 +33,7 @@ def load_compressed(header: PlyHeader) -> Gaussians:
     names = {*(splats.dtype.names or ())}
     kinds = ("position", "rotation", "scale", "color")
     if bounds is None or len(bounds) * CHUNK < len(splats) or not {f"packed_{kind}" for kind in kinds} <= names:
-        raise InputError(header.path, "chunk", "is missing, or has no bounds for some splats")
+        raise InputError(header.path, "chunk", "is missing or lacks bounds for some splats")
     place, turn, scale, colour = (splats[f"packed_{kind}"].astype(np.uint32) for kind in kinds)
 
     def bounds_of(name: str, axes: str) -> list[F32]:
@@ -91,7 +91,9 @@ def load_splat(path: Path) -> Gaussians:
 
 
 def fields_of(packed: U32, bits: tuple[int, ...]) -> F32:
-    """Unpack bit fields from words, as fractions (n, len(bits)) of each field's largest value.
+    """Unpack bit fields from words and scale each by its maximum value.
+
+    The result is fractions of shape (n, len(bits)).
 
     Args:
         packed: Words (n,).

@@ -72,7 +72,7 @@ class SceneFile:
             if self.settings.fit and facing is not None:
                 up, out = turned_to_viewer(up, out, size=high - low, facing=facing)
             log.info(
-                "%s: assuming that %s points up and %s points to the viewer; set content.axes to change this",
+                "%s: assuming that %s points up and %s points towards the viewer; set content.axes to change this",
                 self.path.name,
                 up,
                 out,

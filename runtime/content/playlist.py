@@ -29,15 +29,20 @@ ENTRIES_MAX = 64  # largest number of entries; all are kept in memory
 class PlaylistFile(Section):
     """Contents of a TOML or JSON playlist file, with a `[[show]]` table for each scene."""
 
-    repeat: bool = Field(True, description="restart after the last scene; if false, keep showing the last scene")
+    repeat: bool = Field(True, description="restart after the last scene (if false, keep showing the last scene)")
     show: list[dict[str, Any]] = Field(min_length=1, max_length=ENTRIES_MAX, description="the scenes, in order")
 
 
 class Entry(ContentSettings):
     """A scene in a playlist, with the settings and placement that apply to it."""
 
-    scene: str = Field(min_length=1, description="like content.scene; paths are relative to the playlist's folder")
-    seconds: Annotated[float, within(0.5, 86_400.0, "s")] = Field(description="how long to show the scene, in seconds")
+    scene: str = Field(
+        min_length=1,
+        description="scene to show, specified as in content.scene (paths are relative to the playlist's folder)",
+    )
+    seconds: Annotated[float, within(0.5, 86_400.0, "s")] = Field(
+        description="number of seconds for which to show the scene"
+    )
 
     @field_validator("scene")
     @classmethod
@@ -70,7 +75,9 @@ def read_playlist(path: Path, settings: ContentSettings) -> Playlist:
     if "frames" in table and "show" not in table:
         raise InputError(path, "", f"is a set of cameras for training a NeRF; {CAMERA_SET}")
     if path.suffix.lower() == ".json" and "show" not in table:
-        raise InputError(path, "show", "is missing; a JSON file must be a playlist that lists its scenes here")
+        raise InputError(
+            path, "show", "is missing; a JSON file must be a playlist, with its scenes listed under `show`"
+        )
     file = validated(PlaylistFile, table, source=path)
     common = settings.model_dump(exclude={"scene", "file", *FIELDS})
     entries = []

@@ -81,7 +81,7 @@ def read_header(path: Path) -> PlyHeader:
                 raise InputError(path, "header", f"this line is not valid PLY: {untrusted_input.shown(line.strip())}")
     twice = any(len({name for name, _ in fields}) < len(fields) for fields in properties.values())
     if not order or not properties.get("vertex") or twice:
-        raise InputError(path, "vertex", "the header declares no format, no vertices, or the same property twice")
+        raise InputError(path, "vertex", "the header lacks a format or vertices, or declares a property twice")
     header = PlyHeader(path, order, counts, properties, newline + 1, size)
     for name, count in counts.items():
         field, kind = f"element {untrusted_input.shown(name)}", header.kind
@@ -89,7 +89,7 @@ def read_header(path: Path) -> PlyHeader:
         untrusted_input.within(count, most, source=path, field=field)
         if count > size:  # every element takes at least one byte
             raise InputError(
-                path, field, f"the file is truncated: the header declares {count:,} elements in {size:,} bytes"
+                path, field, f"the file is truncated; the header declares {count:,} elements in {size:,} bytes"
             )
     return header
 
@@ -103,7 +103,7 @@ def read_elements(header: PlyHeader) -> dict[str, Table]:
     path, place, found = header.path, header.starts_at, dict[str, Table]()
     if header.order == "ascii":
         raise InputError(
-            path, "format", "is ascii, but splats can only be read from binary files; save the file as binary PLY"
+            path, "format", "is ascii, but splats can be read only from binary files; save the file as binary PLY"
         )
     with untrusted_input.open_regular(path) as file:
         for name, count in header.counts.items():
@@ -118,5 +118,7 @@ def read_elements(header: PlyHeader) -> dict[str, Table]:
             found[name] = np.frombuffer(file.read(count * dtype.itemsize), dtype)
             place += count * dtype.itemsize
     if "vertex" not in found:
-        raise InputError(path, "vertex", "must come before any element with lists and have one number per property")
+        raise InputError(
+            path, "vertex", "must precede every element with lists, and each of its properties must be a single number"
+        )
     return found

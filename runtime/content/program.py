@@ -47,7 +47,7 @@ SIDES = ("left", "right")
 class ProgramOptions(Section):
     """Options in [content.options] for the scene `program`."""
 
-    port: int = Field(0, ge=0, le=65535, description="TCP port to listen on; 0 for any free port")
+    port: int = Field(0, ge=0, le=65535, description="TCP port to listen on (0 for any free port)")
 
 
 def prepare(file: SceneFile) -> Callable[[Any], ContentSource]:
@@ -132,7 +132,9 @@ class Programs:
             raise InputError("content.options", "port", f"cannot listen on port {port}: {error.strerror}") from None
         self.address = f"ws://{HOST}:{self._server.socket.getsockname()[1]}/?token={self._token}"
         begin("programs", self._server.serve_forever)
-        log.info("waiting for a program to connect; `phasestack status` shows the address under `program`")
+        log.info(
+            "waiting for a program to connect; `phasestack status` shows the address to connect to under `program`"
+        )
 
     def ask(self, views: Sequence[View], *, time_ns: int) -> int:
         """Request a frame's pictures, and return the frame's number.
@@ -159,7 +161,9 @@ class Programs:
                 connection.send(message)
         if program is None:
             why = f" ({self.problem})" if self.problem else ""
-            raise ContentFailure(f"no program is connected{why}; the status shows its address under `program`")
+            raise ContentFailure(
+                f"no program is connected{why}; `phasestack status` shows the address to connect to under `program`"
+            )
         if number not in self._frames:
             raise ContentFailure(f"the program is late: {IN_FLIGHT_MAX} requests are unanswered")
         return number
@@ -252,7 +256,7 @@ class Programs:
             height, width = frame.views[0].height_px, frame.views[0].width_px
             if len(message) - HEAD.size != 4 * width * height:
                 size = len(message) - HEAD.size
-                raise ValueError(f"the answer has {size} bytes instead of {width}x{height} RGBA pixels")
+                raise ValueError(f"the answer has {size} bytes, which is not {width}x{height} RGBA pixels")
             picture = np.frombuffer(message, np.uint8, offset=HEAD.size).reshape(height, width, 4)
             frame.pictures[side] = np.ascontiguousarray(picture[::-1]) if self._bottom_up else picture
             if frame.complete:

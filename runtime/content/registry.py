@@ -94,7 +94,7 @@ def _prepared(file: SceneFile) -> Opener:
             raise InputError(
                 "content",
                 "file",
-                f"is missing; set it to the .ply, .glb or data-set folder of {name}, which is not shipped",
+                f"is missing; set it to the .ply file, .glb file or data-set folder of {name}, which is not shipped",
             )
         return _from_path(replace(file, path=Path(settings.file), preset=name))
     if name == "program":
@@ -225,7 +225,7 @@ def _plugin(name: str, file: SceneFile) -> Opener:
             raise InputError(name, "", written(error)) from error
         if getattr(picture, "shape", None) != (*TRIED_PX[::-1], 4) or picture.dtype != np.uint8:
             source.close()
-            raise InputError(name, "render", "must return an array (height_px, width_px, 4) of RGBA in uint8")
+            raise InputError(name, "render", "must return a uint8 RGBA array of shape (height_px, width_px, 4)")
         return source
 
     return make

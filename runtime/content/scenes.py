@@ -128,7 +128,7 @@ def _sparse() -> tuple[Thing, ...]:
 
 
 def _texture() -> tuple[Thing, ...]:
-    """Return objects in front of a wall that fills the picture from any position."""
+    """Return objects in front of a wall that fills the picture from every viewing position."""
     wall = shapes.card(3.2, 2.4, repeat=(12.0, 9.0))
     return (Thing(wall, "mosaic", (-0.10, 0.0, 0.0), lit=False), *_demo()[3:])
 

@@ -162,7 +162,7 @@ def build_run(
     """
     host = host or Host()
     if options.scale != 1.0 and settings.output.kind != "offscreen":
-        raise InputError("run", "--scale", "requires --headless, because monitors cannot show a scaled stack")
+        raise InputError("run", "--scale", "requires --headless because monitors cannot show a scaled stack")
     cv2.setNumThreads(settings.model.threads or -1)
     simulated, stage_ms = options.max_speed, settings.loop.simulated_stage_ms
     clock: Clock = SimulatedClock() if simulated else MonotonicClock()

@@ -64,7 +64,7 @@ class Choices:
         frozen = [name for name in NEEDS_RESTART if attrgetter(name)(settings) != attrgetter(name)(before)]
         if frozen:
             raise InputError(
-                "reload", ", ".join(frozen), "cannot change while the service is running; restart the service"
+                "reload", ", ".join(frozen), "cannot be changed while the service is running; restart the service"
             )
         same = {at: value for at, value in self.chosen.items() if _value(settings, at) == _value(before, at)}
         return Choices(settings, same)
@@ -170,7 +170,11 @@ class Changes:
 
         def skip(parts: Any) -> str:
             skipped = parts.run.state.content.skip(time_ns=self._presenter.clock.now_ns())
-            return "" if skipped else "there is no next entry: the scene is not a playlist, or it is at its last entry"
+            return (
+                ""
+                if skipped
+                else ("there is no next entry because the scene is not a playlist or is already at its last entry")
+            )
 
         self._between_steps(command, skip)
 

@@ -142,7 +142,10 @@ def unit_advice() -> str:
             return f"{UNIT} is stopped; run: sudo systemctl start {UNIT}"
         case "activating" | "deactivating", _:
             return f"{UNIT} is restarting; see the log: journalctl -u {UNIT} -n 20"
-    return f"{UNIT} is {unit['ActiveState']}; if its configuration sets service.socket, pass that file with --config"
+    return (
+        f"{UNIT} is {unit['ActiveState']}; if its configuration sets service.socket, pass that configuration "
+        "with --config"
+    )
 
 
 class DaemonClient:

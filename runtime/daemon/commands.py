@@ -52,7 +52,9 @@ def parse(request: Any) -> Command:
     if name == "place":
         value = value if value is not None else {}
         if not isinstance(value, dict):
-            raise ValueError("value: place requires an object of settings, or null to restore the configured placement")
+            raise ValueError(
+                "value: place requires an object containing settings, or null to restore the configured placement"
+            )
         for key in value:
             if key not in PLACING:
                 raise ValueError(f"value.{shown(key)}: place accepts only {', '.join(PLACING)}")

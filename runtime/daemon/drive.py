@@ -79,14 +79,17 @@ def print_summary(summary: dict[str, Any], out: Path | None) -> None:
     for line in lines_of({name: value for name, value in summary.items() if name not in (*configured, "configured")}):
         print(line)
     if configured:
-        print("these figures are configured for the simulated clock, not measured:")
+        print("these figures were configured for the simulated clock and not measured:")
         for line in lines_of({name: summary[name] for name in configured}):
             print(f"  {line}")
     if summary["live_db"] is not None:
-        print("for a moving head, quote live_db: the light PSNR at the true eyes against the target of each refresh")
+        print("for a moving head, quote live_db (the light PSNR at the true eyes against the target of each refresh)")
     if summary["light_db"] is not None:
-        print("for a head at rest, quote light_db: the light PSNR at the eyes used, with a tracking error of 1 mm")
+        print(
+            "for a head at rest, quote light_db (the light PSNR at the eye positions used, with a tracking error of 1 "
+            "mm)"
+        )
     if not summary["inferences"]:
-        print("no solution was shown, either because no viewer was seen or because --frames ended the run too early")
+        print("no solution was shown because no viewer was seen or because --frames ended the run too early")
     if out is not None:
         print(f"see {out}/contact-sheet.png, or open {out}/viewer.html to look around")

@@ -57,7 +57,7 @@ def listening_socket(path: Path) -> socket.socket:
         if path.lstat().st_gid != group:  # a sandbox may refuse a chown even if it would change nothing
             os.chown(path, -1, group)
     except (KeyError, PermissionError):
-        log.info("only this user can use the status socket; to share it, add this user to the group %s", GROUP)
+        log.info("only this user can use the status socket; to share the socket, add this user to the group %s", GROUP)
     return made
 
 

@@ -142,6 +142,6 @@ def _line(account: RefreshAccount) -> str:
     assert account.eyes_m is not None and account.solved_for_m is not None
     moved_mm = view_error_mm(account.eyes_m, account.solved_for_m)
     return (
-        f"Refresh {account.frame}: the eyes were {moved_mm:.0f} mm from where the layers were solved for; "
-        "the outer panels were shifted to match"
+        f"Refresh {account.frame}: the eyes were {moved_mm:.0f} mm from the position that the layers were solved for, "
+        "so the outer panels were shifted to match"
     )

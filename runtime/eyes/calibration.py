@@ -175,7 +175,7 @@ def check_similarity(matrix: F64, *, source: str | Path) -> None:
         raise InputError(
             source,
             name,
-            f"must be a rotation times one scale to within {SIMILARITY_TOLERANCE}, but is off by {defect:.2g}",
+            f"must be a rotation times a single scale to within {SIMILARITY_TOLERANCE}, but is off by {defect:.2g}",
         )
     largest = float(np.abs(matrix[:3, :3]).max())
     volume = float(np.linalg.det(matrix[:3, :3] / largest))
@@ -186,7 +186,9 @@ def check_similarity(matrix: F64, *, source: str | Path) -> None:
     scale = largest * float(np.cbrt(volume))  # without scaling, the determinant could overflow
     if not SCALE[0] <= scale <= SCALE[1]:
         raise InputError(
-            source, name, f"has scale {scale:.3g}, but it must be about 1; check that both frames are in metres"
+            source,
+            name,
+            f"has a scale of {scale:.3g}, but the scale must be about 1; check that both frames are in metres",
         )
     distance_m = float(np.linalg.norm(matrix[:3, 3]))
     if distance_m > MAX_DISTANCE_M:

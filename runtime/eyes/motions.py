@@ -114,7 +114,7 @@ def path_of(seed: int) -> Path:
 
 
 def true_eyes(motion: str, times_s: F64, *, path: Path = BENCHMARK_PATH) -> F64:
-    """Return the (n, 2, 3) left and right eye positions during a motion, in metres, frame `stack`.
+    """Return the (n, 2, 3) left and right eye positions during a motion, in metres, in frame `stack`.
 
     Args:
         motion: Name of a motion in `MOTIONS`.

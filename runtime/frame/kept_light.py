@@ -112,7 +112,7 @@ class KeptLight:
                 drawn.wait(LOOK_S)
             if not drawn.is_set():
                 log.warning(
-                    "stopped early: %d of %d refreshes kept by --keep-light have no target pictures",
+                    "stopped early, so %d of %d refreshes kept by --keep-light have no target pictures",
                     total - done,
                     total,
                 )

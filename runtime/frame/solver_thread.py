@@ -140,7 +140,7 @@ class SolverThread(SolverHost):
             thread.join(patience_s(timeout_s))
 
     def _late_reason(self) -> str:
-        """Replace the thread if it hangs, and return the reason why the solver is unavailable or late.
+        """Replace the thread if it has hung, and return the reason why the solver is unavailable or late.
 
         Returns "" if the solver is working on time.
         """
@@ -170,7 +170,7 @@ class SolverThread(SolverHost):
                     attempt.abandoned.set()
                 self._hung.append(attempt)
                 self.restarts += 1
-                log.error("the solver has not answered for %.1f s; starting a new one in its place", busy_ns / NS_PER_S)
+                log.error("the solver has not answered for %.1f s; starting a new one", busy_ns / NS_PER_S)
         busy_ms = busy_ns // NS_PER_MS // ANSWER_STEP_MS * ANSWER_STEP_MS
         return f"the solver {'has not answered' if attempt.ready.is_set() else 'has been restarting'} for {busy_ms} ms"
 

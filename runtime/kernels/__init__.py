@@ -23,7 +23,7 @@ FULL = 255 * SUBCODE  # range of a panel value, which rotates the polarization b
 EDGE_PX = 4  # maximum distance, in pixels, that an image may be sampled beyond its edge
 EDGE_CLAMP_PX = 2  # distance, in pixels, that the values of a picture's border rays are repeated beyond it
 TABLE_STEPS = 16  # table entries per code value, for the intensities of bilinearly sampled rays
-_AGAIN = "install phasestack again (it needs g++)"
+_AGAIN = "reinstall phasestack (this requires g++)"
 _pointer, _int, _long, _float, _double = (
     ctypes.c_void_p, ctypes.c_int32, ctypes.c_int64, ctypes.c_float, ctypes.c_double
 )  # fmt: skip

@@ -169,7 +169,10 @@ def chain_frame(eyes_m: F64, stack: PanelStack, *, most_cell_px: int, reduction:
     height_m, level_rows = max(reached_m) - min(reached_m), stack.height_px / reduction
     share = height_m / window.height_m
     if level_rows * share > ROWS_MAX:
-        raise ValueError(f"implausible eye positions would need a raster {share:.0f} times as high as the panels")
+        raise ValueError(
+            f"these eye positions are implausible because they would require a raster {share:.0f} times as high as "
+            "the panels"
+        )
     row_m = max(window.height_m, height_m / ROWS_SHARE) / level_rows
     if height_m - window.height_m > 0.01 * row_m:
         rows = ROWS_STEP * ceil(height_m / row_m / ROWS_STEP)

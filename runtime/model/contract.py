@@ -31,12 +31,12 @@ class Step(Section):
     )
     places: Places = Field(
         "middle",
-        description="assumed head position: the estimate, or one standard deviation to either side of it, "
-        "alternating from row to row of a picture; the right one is higher (rising) or lower (falling)",
+        description="assumed head position: the estimate, or positions one standard deviation to its left and right "
+        "on alternate picture rows, with the right-hand one on the upper row (rising) or the lower row (falling)",
     )
 
 
-Steps = Annotated[tuple[Step, ...], Field(max_length=64, description="updates of all panels after the network")]
+Steps = Annotated[tuple[Step, ...], Field(max_length=64, description="updates of all panels that follow the network")]
 
 
 class TrainedFor(Section):
@@ -72,19 +72,20 @@ class Contract(Section):
     value_range: tuple[float, float]
     trained_for: TrainedFor | None = Field(description="null if unknown or untrained")
     recipe_sha256: str
-    width_px: Annotated[int, Field(ge=0, le=16384)] = Field(0, description="fixed input width; 0 for any")
-    height_px: Annotated[int, Field(ge=0, le=16384)] = Field(0, description="fixed input height; 0 for any")
+    width_px: Annotated[int, Field(ge=0, le=16384)] = Field(0, description="fixed input width (0 for any)")
+    height_px: Annotated[int, Field(ge=0, le=16384)] = Field(0, description="fixed input height (0 for any)")
     inputs: Annotated[tuple[Port, ...], Field(min_length=1, max_length=32)]
     outputs: Annotated[tuple[Port, ...], Field(min_length=1, max_length=32)]
-    graph_sha256: str = Field("", description="SHA-256 of the file without its metadata; empty if not stated")
+    graph_sha256: str = Field("", description="SHA-256 of the file without its metadata (empty if not specified)")
     precision: Literal["fp32", "fp16", "int8"] = "fp32"
     parameters: Annotated[int, Field(ge=0)] = 0
     cell_px: Annotated[int, Field(ge=1, le=64)] = Field(
-        4, description="for `chain`: the outer panels' parallax in columns of the network's raster"
+        4, description="for `chain`: parallax of the outer panels, in columns of the network's raster"
     )
-    reduction: Literal[1, 2, 4] = Field(2, description="for `chain`: factor by which a panel's raster is divided")
+    reduction: Literal[1, 2, 4] = Field(2, description="for `chain`: factor by which a panel's resolution is divided")
     picture_fov_deg: Annotated[float, Field(ge=0, lt=180)] = Field(
-        0.0, description="horizontal field of view of the training pictures, which are black outside; 0 for unlimited"
+        0.0,
+        description="horizontal field of view of the training pictures, which are black outside it (0 for unlimited)",
     )
     steps: Steps = ()
 

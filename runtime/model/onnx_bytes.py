@@ -46,9 +46,9 @@ def fields(data: memoryview) -> Iterator[tuple[int, memoryview, memoryview]]:
             end = at + length
             value = data[at:end]
         else:
-            raise ValueError("is not a protocol buffer")
+            raise ValueError("is not a valid protocol buffer")
         if end > len(data):
-            raise ValueError("ends too early")
+            raise ValueError("is truncated")
         yield tag >> 3, value, data[begin:end]
         at = end
 
@@ -89,7 +89,7 @@ def _varint(data: memoryview, at: int) -> tuple[int, int]:
     value = shift = 0
     while True:
         if at >= len(data) or shift > 63:
-            raise ValueError("is not a protocol buffer")
+            raise ValueError("is not a valid protocol buffer")
         byte = data[at]
         value |= (byte & 127) << shift
         at, shift = at + 1, shift + 7

@@ -104,7 +104,7 @@ def load_predictor(name: str, stack: PanelStack, settings: ModelSettings | None 
         if not stack.is_evenly_spaced:
             raise InputError(path, "contract.panels", "the model requires evenly spaced panels; use the model sart")
         if tuple(port.name for port in contract.inputs) != INPUTS:
-            raise InputError(path, "contract.inputs", f"are not {', '.join(INPUTS)}; please export the model again")
+            raise InputError(path, "contract.inputs", f"are not {', '.join(INPUTS)}; export the model again")
         return StepPredictor(
             stack, ChainProposal(session), contract.steps, name=contract.name, threads=settings.threads
         )

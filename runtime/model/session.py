@@ -87,7 +87,7 @@ class ModelSession:
         self.contract: Contract = parse_contract(metadata, source=path)
         if self.contract.graph_sha256 and self.contract.graph_sha256 != digest(data):
             raise InputError(
-                path, "contract.graph_sha256", "does not match because the file was changed after its export"
+                path, "contract.graph_sha256", "does not match because the file was changed after it was exported"
             )
         self.input_shapes = {item.name: item.shape for item in self._session.get_inputs()}
         self._types = {item.name: TYPES.get(item.type, np.float32) for item in self._session.get_outputs()}
@@ -148,9 +148,7 @@ class ModelSession:
             for item in items:
                 if item.type not in TYPES:
                     kind = item.type.removeprefix("tensor(").removesuffix(")")
-                    problem = (
-                        f"is {kind}, but must be float32; only tensors inside the graph may have a lower precision"
-                    )
+                    problem = f"is {kind}, but must be float32 (only tensors inside the graph may have lower precision)"
                     raise InputError(path, f"{field}.{item.name}", problem)
 
     def check_fits(self, source: Path, feeds: Mapping[str, Shape], answers: Mapping[str, Shape]) -> None:
@@ -220,7 +218,7 @@ def nodes_elsewhere(session: Any, provider: str) -> tuple[str, ...]:
 def _checked(path: Path, sha256: str) -> bytes:
     data = untrusted_input.read_bytes(path, most_bytes=FILE_BYTES_MAX)
     if sha256 and hashlib.sha256(data).hexdigest() != sha256:
-        raise InputError(path, "", "is not the shipped model, because its SHA-256 differs; reinstall phasestack")
+        raise InputError(path, "", "is not the shipped model (its SHA-256 differs); reinstall phasestack")
     try:
         external = has_external_data(data)
     except ValueError as error:
@@ -278,7 +276,7 @@ def _why_not_loaded(error: Exception) -> str:
             remedy = f"export the model with at most {most}, or install a newer onnxruntime"
             return f"has {what.replace('Opset', 'opset')} {version}, but {runtime} supports at most {most}; {remedy}"
     if found := re.search(r"No Op registered for (\S+)", text):
-        return f"contains the operator {found[1]}, which onnxruntime does not know"
+        return f"contains the operator {found[1]}, which onnxruntime does not support"
     return f"cannot be loaded by onnxruntime: {_first_line(error)}"
 
 

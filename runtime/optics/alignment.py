@@ -70,10 +70,10 @@ def align(stack: PanelStack, *, solved_for_m: F64, eyes_m: F64) -> Alignment:
 
     Args:
         solved_for_m: (2, 3) eyes that the layers were solved for, in frame `stack`.
-        eyes_m: (2, 3) current eyes in frame `stack`.
+        eyes_m: (2, 3) current eye positions in frame `stack`.
     """
     if not (np.abs(solved_for_m).max() <= FARTHEST_M and np.abs(eyes_m).max() <= FARTHEST_M):  # also catches NaN
-        return Alignment(_as_they_are(stack), "the eyes' positions are not finite")
+        return Alignment(_as_they_are(stack), "the eye positions are not finite")
     old, new = _middle(solved_for_m), _middle(eyes_m)
     share, limited = 1.0, ""
     for most, least, why in _limits(stack, solved_for_m, eyes_m, old=old, new=new):
@@ -189,7 +189,10 @@ def _limits(
     for n, x_m in enumerate(stack.x_m):
         if x_m == reference_m:
             continue
-        why = f"the eyes are {moved_m:.3g} m from where the layers were solved for, which is too far to align panel {n}"
+        why = (
+            f"the eyes are {moved_m:.3g} m from the position that the layers were solved for, which is too far "
+            f"to align panel {n}"
+        )
         distance_m, weight = old[0] - x_m, (x_m - reference_m) / (old[0] - reference_m)
         for axis, size_m in ((1, stack.width_m), (2, stack.height_m)):
             shift = abs(weight * (old[axis] * step[0] - step[axis] * distance_m))

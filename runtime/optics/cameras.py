@@ -41,10 +41,10 @@ def as_cameras(matrices: Any) -> tuple[F64, F64]:
     except (TypeError, ValueError):
         cameras = np.empty(0)
     if cameras.shape != (2, 3, 4) or not np.isfinite(cameras).all():
-        raise ValueError("must be a left and a right 3x4 matrix that map metres in the stack's frame to pixels")
+        raise ValueError("must be two 3x4 matrices (left and right) that map metres in the stack frame to pixels")
     turns = np.linalg.det(cameras[:, :, :3])
     if not (np.abs(turns) > 0).all():
-        raise ValueError("must be matrices whose left 3x3 parts have an inverse")
+        raise ValueError("must be matrices whose left 3x3 block is invertible")
     cameras = cameras * np.sign(turns)[:, None, None]  # positive third coordinate in front of the camera
     places_m = -np.linalg.solve(cameras[:, :, :3], cameras[:, :, 3:])[..., 0]
     return cameras, np.asarray(np.round(places_m, DIGITS), np.float64)

@@ -40,7 +40,7 @@ def carried_db(
         layers: (N, H, W, 3 or 4) code values as the panels receive them, rear to front.
         drawn: The (h, w, 3) retina picture for each of the eyes `solved_for_m`, as code values or float in [0, 1].
         solved_for_m: (2, 3) eyes that the layers were solved for, in frame `stack`.
-        eyes_m: (2, 3) true eyes in frame `stack`.
+        eyes_m: (2, 3) true eye positions in frame `stack`.
         fov_deg: The retina pictures' horizontal field of view.
 
     Raises:

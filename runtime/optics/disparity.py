@@ -175,13 +175,11 @@ def disparity_doubts(
     warning += f"{ghosts:.0%} of full scale. The scene is {place(low_m)} to {place(high_m)} the middle panel"
     factors = LARGER ** np.arange(1, 1 + np.log(MOST_LARGER) / np.log(LARGER))
     if larger := next((float(one) for one in factors if compared.ghosts(one * unit_m) <= GHOSTS_MOST), None):
-        warning += (
-            f"; to avoid ghosts, make the gaps {larger:.1f} times as large or divide the disparity by that factor"
-        )
+        warning += f"; to avoid ghosts, increase the gaps by a factor of {larger:.1f} or divide the disparity by it"
     if parallel and low_m > 0:
         shift_px = middle_m / _width_m(eyes_m.mean(axis=0), fov_deg) * pictures[0].shape[1] / 2
         warning += ". The whole scene is in front of that panel, as in a rectified pair from parallel cameras; pass "
         warning += (
-            f"the cameras, or shift the left picture {shift_px:.0f} pixels left and the right picture as far right"
+            f"the cameras, or shift the left picture {shift_px:.0f} pixels left and the right picture right by as much"
         )
     return [warning]

@@ -75,7 +75,7 @@ def squared_errors(
         layers: (N, H, W, 3 or 4) code values, rear to front.
         targets: (h, w, 3) intensities, for each of the eyes `solved_for_m`.
         solved_for_m: (2, 3) eyes that the layers were solved for, in frame `stack`.
-        eyes_m: (2, 3) true eyes in frame `stack`.
+        eyes_m: (2, 3) true eye positions in frame `stack`.
         fov_deg: The targets' horizontal field of view.
         sampling: Rays to trace.
 
@@ -167,7 +167,7 @@ def panels_from_centre(true_m: F64, stack: PanelStack) -> F64:
     """Return the homographies from centre-panel pixels to the pixels of every layer.
 
     Args:
-        true_m: (..., 3) eyes in frame `stack`.
+        true_m: (..., 3) eye positions in frame `stack`.
 
     Returns:
         (..., N, 3, 3) homographies along each eye's rays.

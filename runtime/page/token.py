@@ -52,7 +52,7 @@ def _read(path: Path) -> str:
             raise InputError(path, "", "is not a regular file")
         if status.st_uid != os.geteuid():
             raise InputError(
-                path, "", f"belongs to another user (uid {status.st_uid}), who may know the token; delete the file"
+                path, "", f"belongs to another user (uid {status.st_uid}) who may know the token; delete the file"
             )
         if status.st_mode & 0o077:
             raise InputError(

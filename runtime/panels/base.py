@@ -29,12 +29,13 @@ class PanelSink(ABC):
         """Show a frame on every panel.
 
         The output aligns the solution and then mixes it with the flat picture. The caller must not change the frame's
-        arrays before it has presented another frame, because the output may still be reading them.
+        arrays until it has presented another frame, because the output may still be reading them.
 
         Args:
             frame: The frame to show.
-            unchanged: True if the frame is certain to show the same picture as the previous one. A panel that still
-                shows this picture then does nothing, so the flat picture costs almost nothing while there is no viewer.
+            unchanged: True if the frame is certain to show the same picture as the previous one. A panel that is
+                already showing this picture then skips the update, so displaying the flat picture with no viewer
+                present costs almost nothing.
 
         Raises:
             PanelLost: A panel can no longer show frames. Later calls try to reopen the panels.

@@ -99,7 +99,7 @@ def _connect() -> None:
     except glfw.GLFWError as error:
         raise PanelLost(f"no X server is available: {_text(error)}; check DISPLAY and XAUTHORITY") from None
     if glfw.get_platform() != glfw.PLATFORM_X11:
-        raise MissingPart("GLFW does not use X11, but placing windows on monitors requires X11; start an X server")
+        raise MissingPart("GLFW is not using X11, which is required to place windows on monitors; start an X server")
     xlib.take_over_errors()
     watch = xlib.ServerWatch(_pointer())
 
@@ -211,7 +211,7 @@ class Display:
         """Return a window's state, or None if another program has destroyed it.
 
         Returns:
-            True if the window is mapped, and the region of the X screen it covers.
+            A tuple: whether the window is mapped, and the region of the X screen that it covers.
         """
         refused = xlib.refusals()
         place = Rectangle(*glfw.get_window_pos(window.handle), *glfw.get_window_size(window.handle))

@@ -31,7 +31,9 @@ def measured_curve(path: Path) -> F32:
     lines = [line for line in untrusted_input.read_text(path).splitlines() if line.strip() and line[0] != "#"]
     header = tuple(name.strip().lower() for name in lines[0].split(",")) if lines else ()
     if header not in (COLUMNS, ("phase", "grey")):
-        raise InputError(path, "columns", "must have the columns phase, red, green and blue, or phase and grey")
+        raise InputError(
+            path, "columns", "must have either the columns phase, red, green and blue or the columns phase and grey"
+        )
     if len(lines) < 3:
         raise InputError(path, "phase", "must have at least two rows")
     try:
@@ -54,7 +56,7 @@ def curve(*, lut: str, gamma: float) -> F32:
 
     Args:
         lut: CSV file that contains a measured curve. If empty, the curve follows phase = grey^gamma.
-        gamma: The curve's exponent if there is no file.
+        gamma: Exponent of the curve, used only if `lut` is empty.
 
     Raises:
         InputError: The file cannot be read or its content is invalid.

@@ -99,7 +99,7 @@ def _find(number: int, panel: PanelSettings, monitors: tuple[Monitor, ...]) -> M
         raise InputError(
             "output",
             f"panels.{number}",
-            "does not name a monitor; set edid_serial or connector as shown by `phasestack identify`",
+            "does not select a monitor; set edid_serial or connector to the value shown by `phasestack identify`",
         )
     if len(matches) == 1:
         return matches[0]
@@ -132,4 +132,4 @@ def refresh_difference(monitors: Sequence[Monitor]) -> str:
     if not rates or max(rates) - min(rates) <= REFRESH_TOLERANCE_HZ:
         return ""
     each = ", ".join(f"{monitor.connector} {monitor.refresh_hz:.2f} Hz" for monitor in known)
-    return f"the panels have different refresh rates ({each}), so their frames do not change at the same time"
+    return f"the panels have different refresh rates ({each}), so they do not change frames at the same time"

@@ -171,7 +171,7 @@ class ServerWatch:
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop watching. Call this before closing the connection on purpose."""
+        """Stop watching. Call this before deliberately closing the connection."""
         os.write(self._stop_writing, b".")
         self._thread.join()
         os.close(self._stop_reading)

@@ -122,7 +122,7 @@ def make_plan(
         seeing = (True, True)
     items: list[PlanItem] = []
     if on and not info.moving:
-        why = "the content does not move, so the same solution is shown while the head rests"
+        why = "the content does not move, so the same solution is shown while the head is at rest"
         items.append(_item("render and inference", why, numbers.reuse))
     if on:
         items += network_items(info, numbers)
@@ -132,7 +132,7 @@ def make_plan(
             _item(f"the {side} eye", f"this eye is more than {VISIBLE_DEG:g} degrees off the axis", numbers.one_eye)
         )
     if settings.sensor.driver == "fixed":
-        items.append(_item("the sensor", "the setting sensor.driver = fixed gives the position of the eyes", Saving()))
+        items.append(_item("the sensor", "the eye positions are fixed because sensor.driver is `fixed`", Saving()))
     absent = [name for name in OPTIONAL_PARTS if name not in loaded_modules]
     if absent:
         why = "these modules are not needed and were not imported: " + ", ".join(
@@ -149,7 +149,7 @@ def network_items(info: ContentInfo, numbers: Measured) -> list[PlanItem]:
         why = "everything is in the centre panel's plane, so both eyes see the same picture"
         items.append(_item("inference", why, numbers.focus))
     elif share < 1.0:
-        why = f"the two eyes differ on {share:.0%} of the panel; the rest has a closed-form solution"
+        why = f"the two eyes' pictures differ on {share:.0%} of the panel; the rest has a closed-form solution"
         items.append(_item("inference outside the active window", why, numbers.focus))
     if numbers.left_out.channels == 1:
         why = "the pictures are grey, so one channel is solved for all three"

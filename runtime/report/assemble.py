@@ -56,14 +56,14 @@ class GrowingPage:
         """Write all results measured so far. Raises InputError if the files cannot be written."""
         doing = self.record.get("measuring")
         notes = (
-            [f"This report is not finished and grows as results come in. The last known step is: {doing}."]
+            [f"This report is not finished; results are added as they come in. Last known step: {doing}."]
             if doing
             else []
         )
         if busy := too_busy(self.record["yardsticks_ms"]):
             notes.append(f"Do not compare these times or their ratios, because the machine was busy: {busy}.")
         sections, machine = list(self._sections.values()), self.record["machine"]
-        lead = "Quote the light at a tracking error of 1 mm. Higher is better."
+        lead = "The figure to quote is the light at a tracking error of 1 mm (higher is better)."
         page = Page("Light against run time", lead, sections, machine, self._command, notes)
         page.write(self.out, record="report.json", data=self.record)
 

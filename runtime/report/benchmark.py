@@ -106,7 +106,7 @@ def measured(
     Args:
         models: Model names.
         sizes: Panel widths and heights, in pixels.
-        progress: Function called after each measurement with text that names it.
+        progress: Function called after each measurement with the measurement's name.
     """
     yardsticks, entries = [yardstick_ms()], []
     methods = [Method(name, "network", name) for name in models]

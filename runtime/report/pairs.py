@@ -81,7 +81,9 @@ def read_pairs(folder: Path) -> list[StillPair]:
         if {"panels", "eyes", "images"} <= table.keys():
             pairs.append(_case(path, table))
     if not pairs:
-        raise InputError(folder, "", "contains no case file; a case file is JSON with panels, eyes, images and fov")
+        raise InputError(
+            folder, "", "contains no case files; a case file is a JSON file with panels, eyes, images and fov"
+        )
     return pairs
 
 

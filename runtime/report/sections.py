@@ -102,7 +102,7 @@ def method_table(results: Sequence[MethodResult]) -> Table:
         times = [f"{r.ms_p50 / ordered[0].ms_p50:.1f}", f"{r.ms_p50:.1f}", f"{r.ms_p99:.1f}"]
         rows.append([r.name, *times, f"{r.memory_mib:.0f}", f"{r.parameters:,}", *told])
     size = f"{ordered[0].width_px}x{ordered[0].height_px}"
-    caption = f"Panels of {size}. The worst eye is the worst of all pairs with one ray per pixel."
+    caption = f"Panels have {size}. The worst eye is the worst of all pairs with one ray per pixel."
     return Table(headings, rows, caption)
 
 
@@ -155,7 +155,7 @@ def moving_plot(found: Sequence[Moving]) -> Figure:
         below.set(
             yscale="log",
             ylabel="view error, median, mm",
-            xlabel="raster + steps of every solution (auto: chosen)",
+            xlabel="raster and steps of every solution (auto: chosen by the loop)",
         )
         below.yaxis.set_major_formatter("{x:g}")
         below.set_xticks(range(len(efforts)), efforts)
@@ -174,9 +174,10 @@ def focal_section(stack: FocalStack) -> PageSection:
         conflict = abs(1 / card.card_m - 1 / card.sharpest_shown_m)
         rows.append([name, *(f"{1000 * place:.0f}" for place in places_m), f"{conflict:.3f}"])
     text = [
-        f"Three cards are 5 cm behind, in and 4.5 cm in front of the middle panel. They are seen from {DISTANCE_M:g} m "
-        f"by a pupil of {1000 * PUPIL_M:g} mm. The layers (model {stack.model}) were solved for two pinhole eyes only, "
-        "without a target for the rest of the pupil. On a flat panel, every card is sharpest in the panel's plane."
+        "Three cards are placed 5 cm behind, in and 4.5 cm in front of the middle panel. They are seen from "
+        f"{DISTANCE_M:g} m by a pupil of {1000 * PUPIL_M:g} mm. The layers (model {stack.model}) were solved for two "
+        "pinhole eyes only, without a target for the rest of the pupil. On a flat panel, every card is sharpest in "
+        "the panel's plane."
     ]
     caption = (
         "Vergence against accommodation for the right eye. Up to 0.3 dioptres are commonly considered comfortable."
@@ -198,5 +199,5 @@ def slice_picture(stack: FocalStack) -> Figure:
             axes[0, column].set_title(f"focused {NAMES[column]}", fontsize=10)
         axes[0, 0].set_ylabel("through the layers")
         axes[1, 0].set_ylabel("true")
-    text = "From left to right, the eye focuses on the card behind, in and in front of the middle panel."
+    text = "From left to right, the eye is focused on the card behind, in and in front of the middle panel."
     return Figure("focal-slices", png(figure), text)

@@ -112,7 +112,7 @@ class OpenNI2Driver(Sensor):
         if matches:
             raise SensorLost(f"{len(matches)} OpenNI2 cameras match; set sensor.source to a serial number")
         raise SensorLost(
-            f"no OpenNI2 camera {wanted!r} found among {len(uris)} connected cameras"
+            f"no OpenNI2 camera {wanted!r} was found among {len(uris)} connected cameras"
             if wanted
             else "no OpenNI2 camera found"
         )
@@ -128,7 +128,9 @@ class OpenNI2Driver(Sensor):
         if both and device.is_image_registration_mode_supported(mode):
             device.set_image_registration_mode(mode)
         elif both and not device.is_file():
-            log.warning("OpenNI2: the camera does not register depth to colour, so parallax will shift eye positions")
+            log.warning(
+                "OpenNI2: the camera does not register depth to colour, so parallax will shift the eye positions"
+            )
         for stream in self._streams.values():
             if stream.is_property_supported(7):  # mirroring
                 stream.set_mirroring_enabled(False)

@@ -97,7 +97,7 @@ class RealSenseDriver(Sensor):
             raise SensorLost(f"several RealSense cameras are connected; set sensor.source to one of {choices}")
         if not matches:
             camera = f"RealSense camera {configured!r}" if configured else "RealSense camera"
-            raise SensorLost(f"no {camera} found among {len(serials)} connected cameras")
+            raise SensorLost(f"no {camera} was found among {len(serials)} connected cameras")
         return matches[0]
 
     def read_newest(self, timeout_s: float) -> SensorFrame:

@@ -37,7 +37,9 @@ RECORD, CHUNK = struct.Struct("<BQ"), b"\x06"  # a record's header, with kind an
 CHUNK_HEAD = struct.Struct("<BQQQQII")  # record header, times, size, checksum, length of the compression's name
 EXPANDED_MOST = 8  # assumed compression ratio of a truncated chunk
 WINDOW_BYTES = 1 << 27  # maximum zstandard window size
-NEEDED = "replay requires it and the topic `/eyes`; to play other recordings, write your own driver (docs/sensors.md)"
+NEEDED = (
+    "replay requires it and the topic `/eyes`; to play other recordings, write your own driver (see docs/sensors.md)"
+)
 KINDS = {  # hints for other file types, keyed by their first bytes
     b"#ROSBAG ": " but a ROS 1 bag; convert it with `mcap convert`",
     b"SQLite f": " but a ROS 2 bag in SQLite; convert it with `ros2 bag convert`",

@@ -47,17 +47,22 @@ class EyeSample(Message):
 
     model_config = ConfigDict(title="phasestack.EyeSample")
 
-    sequence: Count = Field(description="frame number of the device; gaps mean lost frames")
-    capture_ns: Count = Field(description="time of exposure, on the monotonic clock")
+    sequence: Count = Field(description="frame number reported by the device (gaps indicate lost frames)")
+    capture_ns: Count = Field(description="time of exposure on the monotonic clock")
     eyes_m: tuple[Point, Point] | None = Field(
-        description="eyes in the `sensor` frame (+x right, +y down, +z away from the sensor); null if there is no face"
+        description="eye positions in the `sensor` frame (+x right, +y down, +z away from the sensor), or null if "
+        "there is no face"
     )
-    confidence: tuple[Unit, Unit] = Field((1.0, 1.0), description="confidence in the left and right eye, 0 to 1")
+    confidence: tuple[Unit, Unit] = Field((1.0, 1.0), description="confidence in the left and right eyes, from 0 to 1")
     covariance_m2: tuple[Row, Row, Row] | None = Field(
         None, description="3x3 covariance of the midpoint of the eyes, if known"
     )
-    completed: Literal["", "left", "right"] = Field("", description="eye that was hidden and has been filled in")
-    true_eyes_m: tuple[Point, Point] | None = Field(None, description="true eyes in the `stack` frame, if known")
+    completed: Literal["", "left", "right"] = Field(
+        "", description="eye that was hidden and whose position has been filled in"
+    )
+    true_eyes_m: tuple[Point, Point] | None = Field(
+        None, description="true eye positions in the `stack` frame, if known"
+    )
 
 
 class Stamp(Message):
@@ -245,7 +250,7 @@ def depth_from_message(data: bytes) -> U16:
     raw = base64.b64decode(image.data)
     if len(raw) != 2 * image.width * image.height:
         raise ValueError(
-            f"a depth image has {len(raw)} bytes, but {image.width} x {image.height} pixels need two bytes each"
+            f"a depth image has {len(raw)} bytes, but {image.width} x {image.height} pixels require two bytes each"
         )
     return np.frombuffer(raw, "<u2").reshape(image.height, image.width).astype(np.uint16)
 

@@ -60,7 +60,7 @@ class ReplayDriver(SteppedSensor):
             if frame.capture_ns <= last_ns:
                 if not is_logged:
                     log.warning(
-                        "%s: skipping sample %d and all others that are not later than the sample before",
+                        "%s: skipping sample %d and all others that are not later than the previous sample",
                         self.path,
                         frame.sequence,
                     )

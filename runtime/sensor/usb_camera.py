@@ -66,12 +66,13 @@ class UsbCameraDriver(Sensor):
     def open(self) -> None:
         self.close()
         if self._is_device and not Path(self._source).exists():
-            raise SensorLost(f"{self._source}: camera not found; connect it or correct sensor.source")
+            raise SensorLost(f"{self._source}: camera not found; connect the camera or correct sensor.source")
         capture = self._opened()
         if not capture.isOpened():
             capture.release()
             raise SensorLost(
-                f"{self._source} cannot be opened; close programs that use it, or add this user to the group video"
+                f"{self._source} cannot be opened; close other programs that use the camera, or add this user to the "
+                "group video"
             )
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
         self._capture = capture

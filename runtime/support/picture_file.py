@@ -68,8 +68,8 @@ def read_views(path: Path, *, background: Colour = WHITE) -> list[U8]:
 def read_animation(path: Path, *, background: Colour = WHITE) -> tuple[list[U8], list[float]]:
     """Read the frames of an animated picture, and the duration of each frame in milliseconds.
 
-    If all frames together have more pixels than one picture may have, only the first frame is read and a warning is
-    logged. Raises InputError if the file cannot be read or decoded.
+    If the frames' total pixel count exceeds the limit for a single picture, only the first frame is read and a
+    warning is logged. Raises InputError if the file cannot be read or decoded.
     """
     data, header = read_coded(path)
     with opened(data) as image:

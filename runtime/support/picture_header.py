@@ -103,7 +103,7 @@ def opened(coded: bytes | IO[bytes]) -> Iterator[Any]:
 
 @cache
 def _formats() -> tuple[str, ...]:
-    """Return Pillow's names of the supported formats, including HEIF if the extra `heic` is installed."""
+    """Return Pillow's names for the supported formats, including HEIF if the extra `heic` is installed."""
     if importlib.util.find_spec("pillow_heif") is None:
         return FORMATS
     import pillow_heif

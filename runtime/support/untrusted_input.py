@@ -156,7 +156,7 @@ def read_bytes(path: str | Path, *, most_bytes: int, source: str | Path = "", fi
         except OSError as error:
             raise InputError(name, field, f"cannot be read: {error.strerror}") from None
     if len(data) > most_bytes:
-        raise InputError(name, field, f"is larger than the maximum of {_size(most_bytes)}")
+        raise InputError(name, field, f"exceeds the maximum size of {_size(most_bytes)}")
     return data
 
 
@@ -233,7 +233,7 @@ def whole_from_text(text: str, *, source: str | Path, field: str) -> int:
     if not (text.isascii() and text.isdigit()):
         raise InputError(source, field, f"must be a non-negative whole number, not {shown(text)}")
     if len(text) > DIGITS_MAX:
-        raise InputError(source, field, f"must not have {len(text)} digits")
+        raise InputError(source, field, f"has {len(text)} digits, but the maximum is {DIGITS_MAX}")
     return int(text)
 
 

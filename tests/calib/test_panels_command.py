@@ -112,7 +112,7 @@ def test_photographs_register_the_panels_in_the_configuration(
     ("spoil", "why"),
     [
         (blurred, "blurred"),
-        (half_covered, "show the whole panel"),
+        (half_covered, "keep the whole panel in view"),
         (lambda picture: picture[:, ::-1], "is mirrored"),
         (lambda picture: np.full_like(picture, 30), "shows no marks"),
     ],

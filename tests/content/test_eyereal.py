@@ -119,7 +119,7 @@ def test_newer_data_name_the_eyes_left_and_right(tmp_path: Path, context: Any, s
 
 
 def test_a_folder_without_pairs_and_a_truncated_picture_are_told(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="contains no pictures named like pair0"):
+    with pytest.raises(InputError, match="contains no pictures with names such as pair0"):
         read_folder(tmp_path, LEGO)
     for half, y in ((0, 0.2), (1, -0.2)):
         (tmp_path / f"pair0_x6.0_y{y}_z2.0_{half}.jpg").write_bytes(b"\xff\xd8\xff broken")
@@ -137,5 +137,7 @@ def test_a_folder_is_read_as_the_preset_in_its_name(tmp_path: Path, context: Any
     assert source.info.name == "lego_bulldozer"
     assert (source.render(view, time_ns=0) == known.render(view, time_ns=0)).all()
     named.rename(other)
-    with pytest.raises(InputError, match=r"from-the-net: name: contains no preset's name; set content.scene"):
+    with pytest.raises(
+        InputError, match=r"from-the-net: name: does not contain the name of a preset; set content.scene"
+    ):
         open_content(ContentSettings(scene=str(other)), stack, context)

@@ -272,7 +272,7 @@ def test_a_camera_set_is_called_so_as_file_and_folder(tmp_path: Path, context: A
     (tmp_path / "transforms_train.json").unlink()
     write_png(tmp_path / "train" / "0.png", solid(RED))
     with pytest.raises(
-        InputError, match="contains no pictures; to show the pictures in train, name that folder instead"
+        InputError, match="contains no pictures; to show the pictures in train, pass that folder instead"
     ):
         opened(tmp_path, context, stack)
     (tmp_path / "a.json").write_text('{"name": "something"}')

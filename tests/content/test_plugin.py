@@ -49,7 +49,7 @@ def test_the_example_is_shown_from_a_folder_of_its_own(tmp_path: Path) -> None:
         (
             "return self",
             'scene = "own:Own"',
-            "own:Own: render: must return an array (height_px, width_px, 4) of RGBA in uint8",
+            "own:Own: render: must return a uint8 RGBA array of shape (height_px, width_px, 4)",
         ),
     ],
 )

@@ -128,7 +128,7 @@ def test_matrices_put_points_where_the_view_has_them(source: Any, placed: bool) 
 
 
 def test_without_a_program_the_state_says_where_one_may_connect(source: Any) -> None:
-    with pytest.raises(ContentFailure, match="no program is connected; the status shows its address"):
+    with pytest.raises(ContentFailure, match="no program is connected; `phasestack status` shows the address"):
         drawn(source)
 
 
@@ -166,7 +166,7 @@ def _draws(source: Any) -> bool:
 
 def test_a_program_with_the_wrong_size_is_told_why_and_may_return(source: Any) -> None:
     program = Program(source, lambda asked, eye: b"x" * 100)
-    with pytest.raises(ContentFailure, match="100 bytes instead of 64x36"):
+    with pytest.raises(ContentFailure, match="100 bytes, which is not 64x36"):
         drawn(source)
     assert program.ended.wait(10) and "100 bytes" in source.problem
     again = Program(source)

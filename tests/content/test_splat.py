@@ -258,8 +258,8 @@ def test_a_compressed_file_stands_by_its_format_s_custom(tmp_path: Path, stack: 
 @pytest.mark.parametrize(
     ("name", "change", "told"),
     [
-        ("a.spz", lambda data: data[: len(data) // 2], "is truncated: the header declares 600 splats"),
-        ("a.spz", lambda data: gzip.decompress(data)[:-1], "is truncated: the header declares 600 splats"),
+        ("a.spz", lambda data: data[: len(data) // 2], "is truncated; the header declares 600 splats"),
+        ("a.spz", lambda data: gzip.decompress(data)[:-1], "is truncated; the header declares 600 splats"),
         (
             "a.spz",
             lambda data: b"NGSP\4\0\0\0\1\0\0\0\0\x0c\0\5\0\0\0\1" + bytes(12),
@@ -306,22 +306,22 @@ def edited(folder: Path, old: bytes, new: bytes, cut: int = 0) -> Path:
         (b"vertex 20", b"vertex 2999999", 0, "element vertex: the file is truncated"),
         (b"vertex 20", b"vertex 3000001", 0, "element vertex: 3,000,001 exceeds the limit of 3,000,000"),
         (b"vertex 20", b"vertex 0", 0, "vertex: the file contains no splats"),
-        (b"element vertex", b"element corner", 0, "vertex: the header declares no format, no vertices"),
+        (b"element vertex", b"element corner", 0, "vertex: the header lacks a format or vertices"),
         (
             b"property float x",
             b"property list uchar float x",
             0,
-            "vertex: must come before any element with lists and have one number per property",
+            "vertex: must precede every element with lists, and each of its properties must be a single number",
         ),
         (
             b"property float nx",
             b"property float x",
             0,
-            "vertex: the header declares no format, no vertices, or the same property twice",
+            "vertex: the header lacks a format or vertices, or declares a property twice",
         ),
         (b"property float nx", b"property words nx", 0, "header: this line is not valid PLY: property words nx"),
         (b"end_header", b"comment", 0, "header: the PLY header is incomplete"),
-        (b"format binary_little_endian 1.0\n", b"", 0, "vertex: the header declares no format"),
+        (b"format binary_little_endian 1.0\n", b"", 0, "vertex: the header lacks a format"),
         (b"format binary_little_endian", b"format ascii", 0, "format: is ascii"),
     ],
 )

@@ -212,7 +212,7 @@ def test_an_empty_configuration_is_no_display_and_status_advises_correctly(pc: P
     pc.done("systemctl daemon-reload; systemctl restart phasestack-x")
     assert eventually(lambda: pc.prop("ActiveState") == "failed")
     told = pc.run("phasestack status").stderr
-    assert "does not name a monitor" in told and "exit status 2" in told
+    assert "does not select a monitor" in told and "exit status 2" in told
     advice = "sudo systemctl restart phasestack"
     assert told.strip().endswith(advice)
     pc.write("etc/phasestack/phasestack.toml", CONFIG)

@@ -250,7 +250,7 @@ def test_a_reload_refuses_what_is_read_only_at_the_start(
     answer = served.asked("reload")
     assert answer == {
         "ok": False,
-        "error": f"reload: {name}: cannot change while the service is running; restart the service",
+        "error": f"reload: {name}: cannot be changed while the service is running; restart the service",
     }
 
 

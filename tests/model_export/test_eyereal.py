@@ -122,7 +122,7 @@ def damaged(state: dict[str, object], change: str) -> dict[str, object]:
     [
         ("missing", "subnets.up1.conv.0.weight: 1 keys of eyereal are missing"),
         ("surplus", "subnets.down9.weight: 1 keys do not belong to eyereal"),
-        ("shape", "subnets.up1.conv.0.weight: has the shape (2, 2), but eyereal has"),
+        ("shape", "subnets.up1.conv.0.weight: has shape (2, 2), but eyereal requires"),
         ("nan", "contains numbers that are not finite"),
     ],
 )

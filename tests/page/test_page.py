@@ -158,7 +158,7 @@ def test_wishes_reach_the_daemon_and_its_refusals_the_page(page: Page, loop: Loo
     code, answer = page.tell("place", "much")
     assert (code, answer["error"]) == (
         409,
-        "value: place requires an object of settings, or null to restore the configured placement",
+        "value: place requires an object containing settings, or null to restore the configured placement",
     )
     assert loop.told == [("scene", "grey"), ("place", {"scale": 2.0}), ("scene", "missing")]
 

@@ -68,7 +68,11 @@ def test_what_reuse_costs_agrees_with_what_is_shown_after_the_drift() -> None:
     [
         ("--scene", "textures", "plan: --scene: `textures` is not a file.* did you mean texture"),
         ("--scene", "nosuch", "17 presets such as lego_bulldozer"),
-        ("--scene", "street", "content: file: is missing; set it to the .ply, .glb or data-set folder of street"),
+        (
+            "--scene",
+            "street",
+            "content: file: is missing; set it to the .ply file, .glb file or data-set folder of street",
+        ),
         ("--model", "nosuch", "plan: --model: 'nosuch'"),
     ],
 )

@@ -303,10 +303,10 @@ export class Display {
     this.canvas = canvas;
     this.stack = stack;
     const g = canvas.getContext("webgl2", { preserveDrawingBuffer: true, alpha: false, antialias: false });
-    if (!g) throw new Error("this browser lacks WebGL 2");
+    if (!g) throw new Error("this browser does not support WebGL 2");
     this.g = g;
     const { width_px: width, height_px: height, x_m } = stack;
-    if (Math.max(width, height) > g.getParameter(g.MAX_TEXTURE_SIZE)) throw new Error("the panels exceed this browser's largest texture");
+    if (Math.max(width, height) > g.getParameter(g.MAX_TEXTURE_SIZE)) throw new Error("the panels are larger than this browser's maximum texture size");
     this.programs = {};
     const each = x_m.map((_, n) => `THROUGH(${n})`).join(" "), sources = { show: SHOW, quick: QUICK, grid: SEE(GRID), boxes: SEE(BOXES) };
     for (const [name, source] of Object.entries(sources)) this.programs[name] = this.#program(VERTEX, source.replace("@PANELS@", x_m.length).replace("@EACH@", each));

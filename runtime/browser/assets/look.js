@@ -3,14 +3,14 @@
 import { Display, alignment, unaligned, drawPlan, middle, moved, reach } from "/display.js";
 
 const MODES = [ // key, name, group, hint
-  ["wiggle", "Wiggle", "Eyes", "Alternates between the two eyes' pictures. The nearest parts jump most."],
+  ["wiggle", "Wiggle", "Eyes", "Alternates between the two eyes' pictures. The nearest parts jump the most."],
   ["parallel", "Side by side", "Eyes", "Look through the screen. The left picture is for the left eye."],
   ["crossed", "Crossed", "Eyes", "Cross your eyes. The left picture is for the right eye."],
   ["anaglyph", "Red and cyan", "Eyes", "For glasses with a red left lens and a cyan right lens."],
   ["left", "Left eye", "Eyes", ""],
   ["right", "Right eye", "Eyes", ""],
   ["panels", "Each panel", "Panels", "What each panel shows, from rear to front."],
-  ["apart", "Drawn apart", "Panels", "One point of the picture and its rays to the two eyes. Point elsewhere to choose another."],
+  ["apart", "Drawn apart", "Panels", "Shows one point of the picture and its rays to both eyes. Point elsewhere to choose another."],
   ["target", "Target", "Check", "What each eye should see from the head position the layers were solved for."],
   ["difference", "Difference × 8", "Check", "What each eye sees minus what it should see, from the head position the layers were solved for. Black is perfect."],
 ];
@@ -26,7 +26,7 @@ const REST_MS = 200, REST_RAYS = 5, STRIPS = 12, WIGGLE_MS = 280, REPORT_MS = 12
 const PAGE = `
 <div class="stage"><canvas tabindex="0" aria-label="What the eyes see. Arrow keys move the head; + and - move it nearer and farther."></canvas>
 <svg class="over" aria-hidden="true"></svg><div class="names" aria-hidden="true"></div><p class="notice" role="status" hidden></p></div>
-<aside><h1></h1><p class="how">Move your head with the pointer, a finger or the arrow keys. The wheel moves it nearer.</p><div class="modes"></div><p class="hint"></p>
+<aside><h1></h1><p class="how">Move your head with the pointer, a finger or the arrow keys. Scroll to move it nearer or farther.</p><div class="modes"></div><p class="hint"></p>
 <div class="switches"><label><input type="checkbox" data-key="aligned" checked> outer panels follow the head</label>
 <label><input type="checkbox" data-key="pupil"> pupils 4 mm wide</label><button type="button" class="quiet">Reset head</button></div>
 <p class="head" role="status"></p><p class="light"></p><div class="point"></div>
@@ -291,7 +291,7 @@ export class Look {
     const parts = [[y, "to the right", "to the left"], [z, "up", "down"], [x, "farther", "nearer"]].filter(([v]) => mm(v));
     const where = parts.length ? `The head is ${parts.map(([v, one, other]) => `${mm(v)} mm ${v > 0 ? one : other}`).join(", ")} from where the layers were solved for` : "The head is where the layers were solved for";
     if (this.state) return void (this.$(".head").textContent = this.state);
-    const limit = limited ? `; the outer panels stop part of the way because the head is ${limited}` : "";
+    const limit = limited ? `; the outer panels follow only part of the way because the head is ${limited}` : "";
     this.$(".head").textContent = `${where}${limit}.`;
   }
 

@@ -288,7 +288,7 @@ function figures(now, asked_ms) {
     "estimated view error": solves && typeof now.view_error_estimated_now_mm === "number" && `${number(now.view_error_estimated_now_mm)} mm`,
     "solution age": solves && `${number(now.solution_age_now_ms, 0)} ms`,
     "uncertainty of the eyes": typeof now.eye_sigma_now_mm === "number" && `${number(now.eye_sigma_now_mm, 2)} mm (${now.eyes_label})`,
-    "delay from the pointer to the picture": latencies.length > 20 && `${number(at(0.5), 0)} ms median, 99% within ${number(at(0.99), 0)} ms`,
+    "delay between pointer and picture": latencies.length > 20 && `${number(at(0.5), 0)} ms median, 99% within ${number(at(0.99), 0)} ms`,
     ...(now.program ? { "drawing program": now.missing?.content ?? (now.program.frame_ms > 0 && `${number(now.program.frame_ms, 0)} ms per frame`), "program's address": now.program.address } : {}),
     "light at the eyes": typeof now.light_db === "number" && `${number(now.light_db)} dB`,
   };

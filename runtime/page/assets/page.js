@@ -320,7 +320,7 @@ async function every(ms, work) {
     try {
       await work();
     } catch {
-      gone("the server of this page does not answer; it has stopped, or the network is down");
+      gone("this page's server does not answer; it has stopped or the network is down");
       pause = RETRY_MS;
     }
     await new Promise((done) => setTimeout(done, pause));
@@ -377,7 +377,7 @@ async function tell(button, command, value = null, where = $("told")) {
     setText(where, said.ok ? `${command}: done${said.file ? `: ${said.file}` : said.note ? `: ${said.note}` : ""}` : `${command}: ${said.error}`);
   } catch {
     where.dataset.kind = "bad";
-    setText(where, `${command}: the server of this page does not answer`);
+    setText(where, `${command}: this page's server does not answer`);
   } finally {
     if (button) {
       button.disabled = false;
