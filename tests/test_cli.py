@@ -81,7 +81,7 @@ def solve_arguments(folder: Path, **changes: object) -> list[str]:
         ),
         (
             {"left_eye": (50, 50, 50), "right_eye": (0.07, -50, -50), "model": "fast"},
-            "--right-eye: fast does not support these eye positions (implausible",
+            "--right-eye: fast does not support these eye positions (these eye positions are implausible",
         ),
         ({"fov": 180}, "--fov"),
         ({"fov": 1e-320}, "--fov"),

@@ -228,10 +228,10 @@ def ply(folder: Path, vertices: Any, faces: Any, form: str = "binary_little_endi
     [
         (9, 10_000_000, "element face: 10,000,000 exceeds the limit of 2,000,000"),
         (10**18, 1, "exceeds the limit of 6,000,000"),
-        (9, 1_999_999, "the file is truncated: the header declares 1,999,999 elements"),
+        (9, 1_999_999, "the file is truncated; the header declares 1,999,999 elements"),
         ("²", 1, "element vertex: must be a non-negative whole number, not ²"),
         (9, "²", "element face: must be a non-negative whole number, not ²"),
-        ("9" * 5000, 1, "element vertex: must not have 5000 digits"),
+        ("9" * 5000, 1, "element vertex: has 5000 digits"),
         (9, "-4", "element face: must be a non-negative whole number, not -4"),
     ],
 )
@@ -292,7 +292,7 @@ GLTFS: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "an address": (
         gltf(buffers=[{"byteLength": 48, "uri": "http://localhost/a.bin"}]),
-        "is not a file in the folder",
+        "is not a local file",
     ),
     "an absolute path": (gltf(buffers=[{"byteLength": 48, "uri": "/etc/passwd"}]), "is an absolute path"),
     "a device": (gltf(buffers=[{"byteLength": 48, "uri": "zero.bin"}]), "uri: is a device"),
@@ -320,7 +320,7 @@ GLTFS: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "an accessor beyond its view": (
         gltf(accessors=[{"bufferView": 0, "componentType": 5126, "count": 99, "type": "VEC3"}] * 2),
-        "is damaged or is not glTF: an accessor reaches beyond its buffer view",
+        "is damaged or is not glTF: an accessor extends beyond its buffer view",
     ),
     "a corner that is not there": (
         gltf(accessors=[{"componentType": 5126, "count": 1, "type": "VEC3"}, *gltf()["accessors"][1:]]),
