@@ -169,11 +169,11 @@ def solve(
             "for these pairs)"
         ),
     ] = "",
-    scale: Annotated[float, number(*SCALE, help="known scale (only with the method fixed-scale)")] = 1.0,
+    scale: Annotated[float, number(*SCALE, help="known scale (fixed-scale method only)")] = 1.0,
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compute the sensor's pose (stack_from_sensor) from pairs. Inadequate pairs are refused.
+    """Compute the sensor's pose (stack_from_sensor) from pairs. Fails if they do not determine it well.
 
     Example: phasestack calibrate solve --pairs pairs.csv --out calibration.toml
     """

@@ -143,7 +143,7 @@ class ContentSource(ABC):
         return None
 
     def skip(self, *, time_ns: int) -> bool:
-        """Skip to a playlist's next entry. Returns False if no entry follows."""
+        """Skip to the next entry of the playlist. Returns False if no entry follows."""
         return False
 
     @property

@@ -210,7 +210,7 @@ class GltfScene:
 
         Args:
             joints: The joints' matrices (j, 4, 4).
-            attribute: Function that returns a vertex attribute by name, or None.
+            attribute: Function that returns the vertex attribute with a given name, or None if it is missing.
         """
         names, weights = attribute("JOINTS_0"), attribute("WEIGHTS_0")
         for number in range(1, 4):

@@ -49,7 +49,7 @@ class PairQuality:
 
 @dataclass(frozen=True)
 class SolvedPair:
-    """Layers for a pair of pictures, with retina images and quality that are computed on first access.
+    """Layers for a pair of pictures. The retina images and the quality are computed on first access.
 
     On first access, ValueError is raised if an eye is behind a panel or sees no part of the panels.
     """

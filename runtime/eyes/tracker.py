@@ -253,7 +253,7 @@ class Tracker:
         """Make `head` the viewer's head.
 
         Args:
-            is_return: True to blend from the last shown position, because the eyes were lost or have jumped.
+            is_return: True if the eyes were lost or have jumped, so that the position blends from the last one shown.
         """
         jump_m, jump_ns = (self._history[-1].jump_m, self._history[-1].jump_ns) if self._history else (NO_JUMP, 0)
         if is_return:

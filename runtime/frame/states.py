@@ -31,7 +31,7 @@ class Conditions:
 def judge(conditions: Conditions) -> tuple[State, str]:
     """Return the daemon's state and the reason for it.
 
-    Stopping takes precedence over starting, starting over missing parts, and missing parts over the eyes.
+    In order of precedence: stopping, starting, missing parts, the state of the eyes.
     """
     if conditions.stopping:
         return State.STOPPING, conditions.stopping

@@ -74,7 +74,7 @@ class Viewer:
 
     @property
     def rate_hz(self) -> float | None:
-        """Number of samples per second recently, or None if fewer than two samples have been captured."""
+        """Recent sampling rate in samples per second, or None if fewer than two samples have been captured."""
         if len(self._captures_ns) < 2 or self._captures_ns[-1] <= self._captures_ns[0]:
             return None
         return round((len(self._captures_ns) - 1) * NS_PER_S / (self._captures_ns[-1] - self._captures_ns[0]), 2)

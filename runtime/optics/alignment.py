@@ -39,7 +39,7 @@ ROWS = 32  # rows resampled at a time; a strip's float32 pixels fit in a core's 
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """Transformation that aligns solved layers to the current eyes."""
+    """Transformation that aligns solved layers with the viewer's current eye positions."""
 
     # For each panel, a (3, 3) scale and shift from shown pixels to the solved layer's pixels.
     solved_from_shown: tuple[F64, ...]

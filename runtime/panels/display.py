@@ -161,7 +161,7 @@ class Display:
         return self._adopt(handle)
 
     def poll(self) -> str:
-        """Process X events, and return any faults that make the windows unusable, or an empty string."""
+        """Process X events, and return a description of any fault that makes the windows unusable, or ""."""
         glfw.poll_events()
         faults = self.faults + [fault for window in self._windows for fault in window.faults]
         return "; ".join(faults)

@@ -62,14 +62,14 @@ class FocalStack:
 
 
 def projection(eye_m: F64, point: F64, *, focus_m: float) -> F64:
-    """Return the 3x4 projection through a point of the pupil, refocused to a given distance.
+    """Return the 3x4 projection matrix through a point in the pupil, refocused to a given distance.
 
     The third homogeneous coordinate of a projected point is its distance from the eye along the gaze, in metres.
 
     Args:
         eye_m: The pupil's centre, shape (3,), in the `stack` frame.
         point: Offset from the pupil's centre, to the right and up, shape (2,), in metres.
-        focus_m: Distance along the gaze where the pictures through all points coincide.
+        focus_m: Distance along the gaze at which the images formed through all points coincide.
     """
     centre = image_from_stack(eye_m, width_px=WIDTH_PX, height_px=HEIGHT_PX, fov_deg=FOV_DEG)
     # As the pupil's point moves, points in front of the plane in focus move the opposite way, and points behind it the

@@ -84,7 +84,7 @@ class BrowserEyes(Sensor):
 
 
 class BrowserCamera(Sensor):
-    """Driver that delivers the camera pictures sent by a web page.
+    """Driver that delivers camera frames sent by a web page.
 
     The camera does not measure depth, so the viewer's distance is estimated from the eye separation.
     """

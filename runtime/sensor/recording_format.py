@@ -147,9 +147,7 @@ class RecordingHeader:
         """
         version = metadata.get("schema_version", "missing")
         if version != str(SCHEMA_VERSION):
-            raise ValueError(
-                f"schema version {version} is not supported; this phasestack reads version {SCHEMA_VERSION}"
-            )
+            raise ValueError(f"schema version {version} is not supported; this release reads version {SCHEMA_VERSION}")
         flags = {f.name: metadata.get(f.name) == "1" for f in fields(cls) if f.type == "bool"}
         return cls(metadata.get("driver", ""), metadata.get("serial", ""), **flags)
 
