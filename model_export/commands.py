@@ -157,7 +157,7 @@ def validate(
     file: Annotated[Path, typer.Argument(help="ONNX file to check")],
     as_json: Annotated[bool, typer.Option("--json", help="print the checks as a JSON object")] = False,
 ) -> None:
-    """Check that a model file meets its contract (names and shapes) and gives valid results for extreme inputs.
+    """Check that a model file meets its contract and gives valid results for extreme inputs.
 
     Exits with 1 if a check fails.
 
