@@ -89,7 +89,7 @@ class _Local:
 
 
 class ChainProposal:
-    """Proposals made by a network whose `input_frame` is `chain`, for three panels with roughly equal gaps."""
+    """Proposals made by a network whose `input_frame` is `chain`, for three panels with similar gaps."""
 
     any_raster = True
 
