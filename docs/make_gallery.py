@@ -17,6 +17,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -49,6 +50,7 @@ from tests.calib.simulator import Camera, camera_from_stack, ideal_panel, photog
 DOCS = Path(__file__).resolve().parent
 IMAGES = DOCS / "images"
 WIDTH_PX, LIMIT_BYTES = 1200, 200_000
+WRAPPED = 120  # characters per line of text
 FILM_BYTES, FILM_PX, FILM_EVERY = 1_500_000, (400, 225), 4  # size limit, picture size, refreshes per film frame
 FILM_S = 2.0, 8.0  # the film's start and end within the run
 PICTURES = {  # name in docs/images: path in the work folder
@@ -84,8 +86,7 @@ HEAD = """\
     phasestack bench compare old.json new.json
 
 **Quote [light](contracts.md#error) at a tracking error of 1 mm** (`light_db`, `"1"`). *One ray* is `psnr_db`. The
-solution time runs from two decoded pictures to 8-bit layers. Memory is the peak memory of the method's own process.
-Compare ratios, not absolute times.
+solution time runs from two decoded pictures to 8-bit layers. Memory is the method's peak. Compare ratios.
 
 `report --pairs` reads every [case file](contracts.md#cases-pairs-calibration) in DIR. The optional field `off`
 lists pictures that should be seen from a point `mm` millimetres away from an eye:
@@ -120,8 +121,13 @@ def page(report: dict[str, Any]) -> str:
         [
             HEAD,
             "## Error against run time\n",
-            f"These figures for built-in scenes with {size} panels come from `{report['command']}` ({facts}). "
-            "SART-n is `sart` after n iterations.\n",
+            fill(
+                f"These figures for built-in scenes with {size} panels come from `{report['command']}` ({facts}). "
+                "SART-n is `sart` after n iterations.",
+                width=WRAPPED,
+                break_on_hyphens=False,
+            )
+            + "\n",
             _table(HEADINGS, rows),
             "![light against run time](images/frontier.png)\n",
             "## What a moving viewer sees\n",
