@@ -174,7 +174,7 @@ def test_an_eye_at_the_front_panel_is_held_at_the_nearest_place(x_m: float) -> N
 
 def test_eyes_too_far_off_are_held_where_an_outer_panel_would_leave() -> None:
     beyond = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([0.0, 4.0, 0.0]))
-    assert "too far to align panel 0" in beyond.limited and "4 m from where" in beyond.limited
+    assert "too far to align panel 0" in beyond.limited and "4 m from the position" in beyond.limited
     assert beyond.solved_from_shown[0][0, 2] == pytest.approx(MOST_SHIFT * 1920)
     assert same(beyond, align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([0.0, 8.0, 0.0])))
 
