@@ -186,7 +186,7 @@ def test_a_chunk_whose_kind_is_damaged_ends_the_recording_with_a_line(
 
 def test_another_program_s_or_version_s_recording_is_called_so(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    foreign = r"missing from this MCAP recording \(ros2, libmcap 0\.8\.0, topic /camera/image\); .*`/eyes`.* \(see docs/sensors"
+    foreign = r"missing from this MCAP recording \(ros2, libmcap 0\.8\.0, topic /camera/image\); .*`/eyes`.* \(see docs"
     for name, told in (("else", foreign), ("phasestack.recording", "schema version 99 is not supported")):
         with path.open("wb") as file:
             writer = Writer(file)
