@@ -32,9 +32,9 @@ ROWS_STEP = 32  # if the eyes are not level, the number of rows is rounded up to
 # time.
 ROWS_SHARE = 1.75
 CELLS_MAX = 1024
-# Maximum column width, in panel columns / `reduction`. 1.2 would lose up to 0.25 dB, and 0.4 would gain nothing.
+# Maximum column width, in panel columns / `reduction`. 1.2 would lose up to 0.25 dB, and 0.7 would gain nothing.
 WIDEST = 0.8
-LEAST_CELL_PX = 2  # with one column per parallax, eyes near small panels would see 8 % more error
+LEAST_CELL_PX = 2  # one column per parallax would exceed a recorded error limit (eyes near a panel of 64 columns)
 BLOCK_ROWS = 8  # rows that the network transforms together; the number of rows is always a multiple of this
 ROWS_MAX = 1 << 15  # eye positions are implausible if they would need more rows than this at full height
 NEAREST_F = 0.8  # maximum ratio of the raster's half width to the distance from its middle to F

@@ -17,6 +17,7 @@ from runtime.model.geometry import visible_boxes
 from runtime.model.job import drawn_job
 from runtime.model.predictor import load_predictor
 from runtime.model.sart import SartPredictor
+from runtime.model.session import ModelSession
 from runtime.model.still import solve_still
 from runtime.optics.carried import expected_psnrs_db
 from runtime.optics.light import ONE_RAY
@@ -124,6 +125,25 @@ def test_a_head_that_is_turned_and_tilted_by_50_degrees_is_served_as_well() -> N
     level = eyes_at(distance_m=1.25, angle_deg=47)
     from_level = displayed(solved("balanced", level), level, STACK).psnr_db
     assert displayed(solved("balanced", pair), pair, STACK).psnr_db > from_level - 1.5
+
+
+def test_a_turned_and_tilted_head_gives_the_network_no_larger_raster(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Transposed rows, which such a head does not need, would be three times as much work."""
+    sizes = []
+    run = ModelSession.run
+
+    def counted(self: ModelSession, feeds: dict[str, np.ndarray], shapes: dict[str, tuple[int, ...]]) -> object:
+        sizes.append(feeds["left"].size)
+        return run(self, feeds, shapes)
+
+    monkeypatch.setattr(ModelSession, "run", counted)
+    predictor = load_predictor("fast", STACK)
+    grey = np.full((270, 480, 4), 128, np.uint8)
+    # At the side: one eye is nearer, and the eyes are farther apart in height than sideways.
+    turned = np.array([[0.85, 1.015, -0.011], [0.81, 1.045, -0.049]])
+    for pair in (eyes(0.7), turned):
+        predictor.solve(drawn_job([grey, grey], pair, STACK))
+    assert sizes[1] < 1.5 * sizes[0]
 
 
 def test_a_head_that_lies_down_and_sits_up_again_leaves_nothing_behind() -> None:
