@@ -47,26 +47,27 @@ def project(pixels_from_stack: F64, points_m: F64) -> tuple[F64, F64]:
 
     Pixel coordinates are undefined for points behind the eye.
     """
-    homogeneous = points_m @ pixels_from_stack[:, :3].T + pixels_from_stack[:, 3]
+    # A contiguous row per coordinate makes the arithmetic and the reductions several times as fast.
+    homogeneous = pixels_from_stack[:, :3] @ points_m.T + pixels_from_stack[:, 3:]
     with np.errstate(divide="ignore", invalid="ignore"):
-        return homogeneous[:, :2] / homogeneous[:, 2:], homogeneous[:, 2]
+        return (homogeneous[:2] / homogeneous[2]).T, homogeneous[2]
 
 
-def covered_box(view: View, corners_m: F64, *, align_px: int = 32) -> PixelRect:
+def covered_box(view: View, points_m: F64, *, align_px: int = 32) -> PixelRect:
     """Return a pixel box that contains the projected convex hull of the given points.
 
     The box is empty if all points are behind the eye, and covers the whole raster if some of them are.
 
     Args:
         view: View that the points are projected into. The box is clipped to its raster.
-        corners_m: Points (n, 3) in frame `stack`.
+        points_m: Points (n, 3) in frame `stack`.
         align_px: Enlarge the box to multiples of this number of pixels.
     """
-    pixels, depths = project(view.pixels_from_stack, corners_m)
-    if depth_bounds(view, corners_m)[1] <= 2 * NEAREST_M:
+    pixels, depths = project(view.pixels_from_stack, points_m)
+    if _bounds(depths)[1] <= 2 * NEAREST_M:
         return PixelRect(0, 0, 0, 0)
     size = [view.width_px, view.height_px]
-    if (depths <= NEAREST_M).any():
+    if depths.min() <= NEAREST_M:
         return PixelRect(0, 0, *size)
     low = np.floor((pixels.min(0) - 1) / align_px) * align_px
     high = np.ceil((pixels.max(0) + 1) / align_px) * align_px
@@ -77,6 +78,9 @@ def covered_box(view: View, corners_m: F64, *, align_px: int = 32) -> PixelRect:
 
 def depth_bounds(view: View, corners_m: F64) -> tuple[float, float]:
     """Return near and far distances in metres that leave a margin around all corners in front of the eye."""
-    depths = project(view.pixels_from_stack, corners_m)[1]
-    far = float(depths.max()) * 1.001 + NEAREST_M
-    return max(float(depths.min()) * 0.999 - NEAREST_M, min(NEAREST_M, far / 2)), far
+    return _bounds(corners_m @ view.pixels_from_stack[2, :3] + view.pixels_from_stack[2, 3])
+
+
+def _bounds(depths_m: F64) -> tuple[float, float]:
+    far = float(depths_m.max()) * 1.001 + NEAREST_M
+    return max(float(depths_m.min()) * 0.999 - NEAREST_M, min(NEAREST_M, far / 2)), far

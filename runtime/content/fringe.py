@@ -13,10 +13,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.content.shapes import I32, Shape
+from runtime.content.shapes import I32, Shape, welded
 from runtime.records import F32, F64
 
-CORNER_ENDS = (0, 0, 1, 1, 0, 1)
+CORNER_ENDS = (0, 1, 0, 1)  # two corners on the edge, then two outside the outline
+TRIANGLES = (0, 2, 1, 1, 2, 3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,17 +35,16 @@ class Edges:
 def edges_of(shape: Shape) -> Edges:
     """Return the edges of a shape. Vertices at the same position are treated as one."""
     positions = shape.positions_m.astype(np.float64)
-    extent = max(float(np.ptp(positions, axis=0).max()), 1e-9)
-    welded = np.unique(np.rint(positions / extent * 1e6).astype(np.int64), axis=0, return_inverse=True)[1].reshape(-1)
-    triangles = shape.triangles
+    triangles, places = shape.triangles, welded(shape.positions_m)
     vertices = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     apex = np.concatenate([triangles[:, 2], triangles[:, 0], triangles[:, 1]])
     face = np.tile(np.arange(len(triangles)), 3)
-    swapped = welded[vertices[:, 0]] > welded[vertices[:, 1]]
+    swapped = places[vertices[:, 0]] > places[vertices[:, 1]]
     vertices[swapped] = vertices[swapped][:, ::-1]
-    key = welded[vertices[:, 0]] * (int(welded.max()) + 1) + welded[vertices[:, 1]]
-    places = np.sort(welded[triangles], axis=1)
-    real = np.tile((np.diff(places, axis=1) > 0).all(1), 3)  # a sphere has zero-area triangles at its poles
+    key = places[vertices[:, 0]] * (int(places.max()) + 1) + places[vertices[:, 1]]
+    real = np.tile(
+        (np.diff(np.sort(places[triangles], axis=1), axis=1) > 0).all(1), 3
+    )  # a sphere has zero-area triangles at its poles
     order = np.flatnonzero(real)[np.argsort(key[real], kind="stable")]
     first = np.flatnonzero(np.r_[True, np.diff(key[order]) != 0]) if order.size else np.empty(0, np.int64)
     second = np.minimum(first + 1, max(order.size - 1, 0))
@@ -86,6 +86,7 @@ class Outlines:
             border=np.concatenate([edges.border for edges in each]),
         )
         self._part = np.repeat(np.arange(len(each)), [len(edges.faces) for edges in each])
+        self._first, self._second = np.ascontiguousarray(self._edges.faces.T, np.intp)
 
     def seen(self, eyes: Sequence[F64 | None]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Return the edges that are on an outline, and the index of each edge's part.
@@ -104,15 +105,16 @@ class Outlines:
         for (begin, end), eye in zip(self._faces, eyes, strict=True):
             if eye is not None:
                 facing[begin:end] = edges.normals[begin:end] @ eye > edges.heights[begin:end]
-        first, second = facing[edges.faces.T]
-        is_seen = np.array([eye is not None for eye in eyes])[self._part]
-        chosen = np.flatnonzero((edges.border | (first != second)) & is_seen)
+        first = facing[self._first]
+        chosen = np.flatnonzero(edges.border | (first != facing[self._second]))
+        if any(eye is None for eye in eyes):
+            chosen = chosen[np.array([eye is not None for eye in eyes])[self._part[chosen]]]
         which = np.where(edges.border[chosen] | first[chosen], 0, 1)
         return np.column_stack([edges.ends[chosen, which], edges.apex[chosen, which]]), self._part[chosen]
 
 
 def ramps(points: F64, *, width_px: int, height_px: int, ramp_px: float = 1.0) -> tuple[F32, NDArray[np.intp]]:
-    """Return a ramp of two triangles for each outline edge.
+    """Return a ramp, a quadrilateral, for each outline edge.
 
     A ramp's coverage falls from 1 at the edge to 0 outside the outline. An edge gets no ramp if it is partly behind the
     eye or too short to have a direction.
@@ -124,24 +126,24 @@ def ramps(points: F64, *, width_px: int, height_px: int, ramp_px: float = 1.0) -
         ramp_px: Ramp width in pixels.
 
     Returns:
-        Clip coordinates and coverage (m, 6, 5) at the six corners of each of m ramps, and the index (m,) of each ramp's
-        edge. `CORNER_ENDS` states which end of the edge each corner takes its attributes from.
+        Clip coordinates and coverage (m, 4, 5) at the four corners of each of m ramps, and the index (m,) of each
+        ramp's edge. `CORNER_ENDS` states which end of the edge each corner takes its attributes from, and `TRIANGLES`
+        which corners form the two triangles.
     """
-    scale = np.array([width_px / 2, height_px / 2])
     kept = np.flatnonzero((points[..., 3] > 1e-6).all(1))
     points = points[kept]
-    pixels = points[..., :2] / points[..., 3:] * scale
-    along = pixels[:, 1] - pixels[:, 0]
-    length = np.hypot(along[:, 0], along[:, 1])
+    w = points[..., 3]
+    u, v = points[..., 0] / w * (width_px / 2), points[..., 1] / w * (height_px / 2)
+    along_u, along_v = u[:, 1] - u[:, 0], v[:, 1] - v[:, 0]
+    length = np.hypot(along_u, along_v)
     long_enough = length > 1e-3
-    points, pixels, kept = points[long_enough], pixels[long_enough], kept[long_enough]
-    along = along[long_enough] / length[long_enough, None]
-    outward = np.column_stack([-along[:, 1], along[:, 0]])
-    inside = ((pixels[:, 2] - pixels[:, 0]) * outward).sum(1)
-    outward *= np.where(inside > 0, -ramp_px, ramp_px)[:, None]
-    corners = np.repeat(points[:, :2], 2, axis=1)
-    coverage = np.tile([1.0, 0.0, 1.0, 0.0], (len(points), 1))
-    corners[:, 1::2, :2] += (outward / scale)[:, None] * corners[:, 1::2, 3:]
-    quad = [0, 1, 2, 2, 1, 3]
-    packed = np.concatenate([corners, coverage[..., None]], axis=2)[:, quad]
-    return packed.astype(np.float32), kept
+    kept, points = kept[long_enough], points[long_enough]
+    length, along_u, along_v = length[long_enough], along_u[long_enough], along_v[long_enough]
+    inside = (v[long_enough, 2] - v[long_enough, 0]) * along_u - (u[long_enough, 2] - u[long_enough, 0]) * along_v
+    outward = np.where(inside > 0, -ramp_px, ramp_px) / length
+    corners = np.empty((len(kept), 4, 5), np.float32)
+    corners[:, :2, :4] = corners[:, 2:, :4] = points[:, :2]
+    corners[:, 2:, 0] -= (along_v * outward / (width_px / 2))[:, None] * points[:, :2, 3]
+    corners[:, 2:, 1] += (along_u * outward / (height_px / 2))[:, None] * points[:, :2, 3]
+    corners[:, :2, 4], corners[:, 2:, 4] = 1.0, 0.0
+    return corners, kept

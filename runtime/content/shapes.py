@@ -57,6 +57,44 @@ def join(shapes: Sequence[Shape]) -> Shape:
     )
 
 
+def welded(positions_m: F32) -> NDArray[np.int64]:
+    """Number the distinct positions among the vertices (v, 3), and return the number (v,) of each vertex's position."""
+    positions = positions_m.astype(np.float64)
+    extent = max(float(np.ptp(positions, axis=0).max()), 1e-9)
+    places = np.rint(positions / extent * 1e6).astype(np.int64)
+    return np.asarray(np.unique(places, axis=0, return_inverse=True)[1].reshape(-1), np.int64)
+
+
+def solid_winding(shape: Shape) -> int:
+    """Return the winding of a solid shape's triangles as seen from outside, or 0 if the shape is not solid.
+
+    The triangles of a solid shape enclose volumes and have the same winding everywhere: 1 if it is counter-clockwise,
+    -1 if it is clockwise. From outside, the back faces of such a shape are always hidden. Vertices at the same position
+    are treated as one, and connected triangles as one body.
+    """
+    corners = welded(shape.positions_m)[shape.triangles]
+    real = (np.diff(np.sort(corners, axis=1), axis=1) > 0).all(1)  # a sphere has zero-area triangles at its poles
+    corners, triangles = corners[real], shape.triangles[real]
+    if not len(corners):
+        return 0
+    count = int(corners.max()) + 1
+    begin, end = corners.reshape(-1), corners[:, [1, 2, 0]].reshape(-1)
+    if not np.array_equal(np.sort(begin * count + end), np.sort(end * count + begin)):
+        return 0  # an edge is not passed as often in one direction as in the other
+    body = np.arange(count)
+    while True:  # the smallest vertex number spreads over each body
+        before = body
+        body = before.copy()
+        np.minimum.at(body, corners.reshape(-1), np.repeat(before[corners].min(1), 3))
+        body = body[body]
+        if np.array_equal(body, before):
+            break
+    points = (shape.positions_m - shape.positions_m.mean(0)).astype(np.float64)[triangles]
+    volumes = (points[:, 0] * np.cross(points[:, 1], points[:, 2])).sum(1)
+    of_body = np.bincount(body[corners[:, 0]], volumes, count)[np.unique(body[corners])]
+    return int((of_body > 0).all()) - int((of_body < 0).all())
+
+
 def flat_normals(corners: ArrayLike) -> F32:
     """Return the triangles' unit normals (t, 3). The normal is zero if a triangle has no area.
 

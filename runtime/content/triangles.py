@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from runtime.content import camera
 from runtime.content.base import ContentInfo, View
 from runtime.content.canvas import OVER, CanvasSource
-from runtime.content.fringe import CORNER_ENDS, Outlines, edges_of, ramps
+from runtime.content.fringe import CORNER_ENDS, TRIANGLES, Outlines, edges_of, ramps
 from runtime.content.parts import OPAQUE_FROM, OUTLINED_MAX, Part, Sampler
+from runtime.content.shapes import solid_winding
 from runtime.optics.rect import PixelRect
 from runtime.records import F32, F64, U8
 from runtime.support.background import raise_if_abandoned
@@ -156,10 +157,13 @@ class DrawnPart:
                 self.vertices[:, first : first + values.shape[1]] = values
         outlined = outlined and not self.is_blended and len(mesh.triangles) <= OUTLINED_MAX
         self.edges = edges_of(mesh) if outlined else None
+        opaque = not {"BLEND", "HOLES"} & set(self.features)
+        self._solid_winding = solid_winding(mesh) if opaque and len(mesh.triangles) <= OUTLINED_MAX else 0
         low, high = mesh.positions_m.min(0), mesh.positions_m.max(0)
         if part.turning:
             reach = float(np.linalg.norm(mesh.positions_m, axis=1).max())
             low, high = np.full(3, -reach), np.full(3, reach)
+        self._low_m, self._high_m = low, high
         self.corners_m = camera.box_corners(low, high)  # (8, 3) corners of the bounding box, in the part's frame
         self.textures: list[Any] = []
 
@@ -167,6 +171,14 @@ class DrawnPart:
     def positions(self) -> F32:
         """Vertex positions (v, 3) in the part's frame. They may be empty after `upload`."""
         return self.vertices[:, :3]
+
+    def front_faces(self, look: _Look) -> str | None:
+        """Return the winding, `cw` or `ccw`, of all visible faces in a look's picture, or None if both may be visible."""
+        if not self._solid_winding or look.eye is None:
+            return None
+        if not ((look.eye < self._low_m) | (look.eye > self._high_m)).any():  # from within, the inside is visible
+            return None
+        return look.front_face if self._solid_winding > 0 else {"cw": "ccw", "ccw": "cw"}[look.front_face]
 
     def upload(self, context: Any, surface_program: Any, outline: Any, textures: list[Any]) -> None:
         """Create the part's GL objects.
@@ -207,6 +219,7 @@ class _Place:
         volume = float(np.linalg.det(linear))
         self.stack_from_part = stack_from_part
         self.part_from_stack = np.linalg.inv(stack_from_part) if volume else None  # None if the part is flattened
+        self.is_mirrored = volume < 0
         self.normals = np.linalg.pinv(linear).T * np.cbrt(abs(volume))
 
 
@@ -215,10 +228,17 @@ class _Look:
 
     def __init__(self, place: _Place, clip_from_stack: F64, view: View) -> None:
         inverse = place.part_from_stack
+        # The raster's rows run along +y in OpenGL, which mirrors triangles.
+        self.front_face = "ccw" if place.is_mirrored else "cw"
         self.eye = None if inverse is None else inverse[:3, :3] @ view.eye_m + inverse[:3, 3]  # None if flattened
         turned = place.normals if view.display_from_view is None else view.display_from_view @ place.normals
         self.clip_from_part = clip_from_stack @ place.stack_from_part
         self._clip, self._normals = _gl(self.clip_from_part), _gl(turned)
+
+    def project(self, points: F64) -> F64:
+        """Return the clip coordinates (k, n, 4) of points (k, n, 3) in the part's frame."""
+        clip = points.reshape(-1, 3) @ self.clip_from_part[:, :3].T + self.clip_from_part[:, 3]
+        return np.asarray(clip.reshape(*points.shape[:2], 4), np.float64)
 
     def set(self, program: Any, part: DrawnPart) -> None:
         """Set the uniforms and textures that a program needs to draw a part."""
@@ -276,13 +296,16 @@ class TriangleSource(CanvasSource):
             self._corners = np.concatenate([part.vertices for _, part, _ in self._outlined])
             for (begin, end), (_, part, _) in zip(pairwise(self._edges.vertices_before), self._outlined, strict=True):
                 part.vertices = self._corners[begin:end]  # a view avoids a second copy
-        self._outline_buffer = context.buffer(reserve=max(edges, 1) * 6 * OUTLINE_FLOATS * 4, dynamic=True)
+        first_corners = len(CORNER_ENDS) * np.arange(max(edges, 1), dtype=np.int32)
+        floats = first_corners.size * len(CORNER_ENDS) * OUTLINE_FLOATS
+        self._outline_buffer = context.buffer(reserve=4 * floats, dynamic=True)
+        self._outline_triangles = context.buffer(first_corners[:, None] + np.array(TRIANGLES, np.int32))
         self._outlines: dict[tuple[str, ...], Any] = {}
         for part in self.parts:
             pictures = [picture for picture in part.pictures if picture is not None]
             textures = [self._texture(picture, part.sampler) for picture in pictures]
             part.upload(context, self._program(part.features), self._outline(part.features), textures)
-        self.held += [*self.parts, *self._outlines.values(), self._outline_buffer]
+        self.held += [*self.parts, *self._outlines.values(), self._outline_buffer, self._outline_triangles]
         self.held += [*self._textures.values(), *self._programs.values()]
 
     def places(self, time_ns: int) -> Sequence[F64]:
@@ -325,7 +348,13 @@ class TriangleSource(CanvasSource):
             looks = [shared[id(place)] for place in arranged.places]
             placed = [(self.parts[n], looks[n]) for n in arranged.nearest_first]
             self.context.enable_only(self.context.DEPTH_TEST)
+            self.context.cull_face = "back"
             for part, look in placed:
+                if (front := part.front_faces(look)) is None:
+                    self.context.disable(self.context.CULL_FACE)
+                else:
+                    self.context.enable(self.context.CULL_FACE)
+                    self.context.front_face = front
                 look.set(part.surface_program, part)
                 least = OPAQUE_FROM if part.is_blended else part.cutoff
                 _set_uniforms(part.surface_program, kept=(least, ANY_ALPHA))
@@ -348,11 +377,11 @@ class TriangleSource(CanvasSource):
         context, framebuffer = self.context, self.context.fbo
         context.enable_only(context.DEPTH_TEST | context.BLEND | context.CULL_FACE)
         context.blend_func = OVER
-        context.front_face = "cw"  # the raster's rows run along +y in OpenGL, which mirrors triangles
         framebuffer.depth_mask = False
         for part, look in reversed(placed):
             if part.is_blended:
                 look.set(part.surface_program, part)
+                context.front_face = look.front_face
                 _set_uniforms(part.surface_program, kept=(1 / 255, OPAQUE_FROM))
                 for hidden in ("front", "back") if part.two_sided else ("back",):
                     context.cull_face = hidden
@@ -374,7 +403,9 @@ class TriangleSource(CanvasSource):
             program = self._program((*features, "OUTLINE"))
             names = ("in_clip", "in_coverage", *ATTRIBUTES)
             layout = _layout(program, self._outline_buffer, names, (4, 1, 3, 2, 4))
-            self._outlines[features] = self.context.vertex_array(program, [layout])
+            self._outlines[features] = self.context.vertex_array(
+                program, [layout], index_buffer=self._outline_triangles
+            )
         return self._outlines[features]
 
     def _texture(self, picture: U8, sampler: Sampler) -> Any:
@@ -396,11 +427,13 @@ class TriangleSource(CanvasSource):
         rank = np.argsort(nearest_first)[[n for n, _, _ in self._outlined]]
         order = np.argsort(-rank[of_part], kind="stable")
         seen, of_part = seen[order], of_part[order]
-        clips = np.stack([looks[n].clip_from_part for n, _, _ in self._outlined])[of_part]
-        points = self._corners[seen, :3] @ clips[:, :, :3].transpose(0, 2, 1) + clips[:, None, :, 3]
+        ends = np.flatnonzero(np.diff(of_part, append=-1)) + 1
+        points, clip = self._corners[seen, :3].astype(np.float64), np.empty((len(seen), 3, 4))
+        for begin, end in pairwise([0, *ends.tolist()]):
+            clip[begin:end] = looks[self._outlined[of_part[begin]][0]].project(points[begin:end])
         size = {"width_px": view.width_px, "height_px": view.height_px}
-        corners, kept = ramps(points, **size, ramp_px=1 / view.reduction)
-        packed = np.empty((len(kept), 6, OUTLINE_FLOATS), np.float32)
+        corners, kept = ramps(clip, **size, ramp_px=1 / view.reduction)
+        packed = np.empty((len(kept), len(CORNER_ENDS), OUTLINE_FLOATS), np.float32)
         packed[..., :5] = corners
         packed[..., 5:] = self._corners[seen[kept][:, CORNER_ENDS], 3:]
         self._outline_buffer.write(packed)
@@ -413,7 +446,7 @@ class TriangleSource(CanvasSource):
             n, part, _ = self._outlined[of_part[kept[begin]]]
             looks[n].set(part.outline.program, part)
             _set_uniforms(part.outline.program, kept=(part.cutoff, ANY_ALPHA))
-            part.outline.render(first=6 * begin, vertices=6 * (end - begin))
+            part.outline.render(first=len(TRIANGLES) * begin, vertices=len(TRIANGLES) * (end - begin))
         framebuffer.depth_mask = True
 
 

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from runtime.content import shapes
-from runtime.content.camera import project
+from runtime.content.base import View
+from runtime.content.camera import clip_from_stack, project
 from runtime.content.procedural import ProceduralSource
 from runtime.content.scenes import SCENES, Scene, Thing
+from runtime.content.triangles import DrawnPart, _Look
 from runtime.optics.stack import PanelStack
 from tests.content.conftest import image_view, panel_view
 
@@ -120,3 +122,28 @@ def test_outlines_are_smooth_and_grow_by_less_than_a_pixel(
     assert (np.abs(np.diff(smooth, axis=0)) == 255).mean() < 0.5 * (np.abs(np.diff(hard, axis=0)) == 255).mean()
     outline_px = ((wanted > 0) & (wanted < 255)).sum()
     assert 0.2 < (smooth - wanted).sum() / 255 / outline_px < 0.8
+
+
+@pytest.mark.parametrize("eye", EYES.values(), ids=EYES.keys())
+def test_leaving_out_the_back_faces_of_solid_things_changes_no_picture(
+    context: Any, stack: PanelStack, monkeypatch: pytest.MonkeyPatch, eye: tuple[float, ...]
+) -> None:
+    source = ProceduralSource("demo", stack=stack, context=context)
+    source._with_ramps = False
+    view = panel_view(eye, stack.panel(1))
+    culled = source.render(view, time_ns=0).astype(int)
+    assert sum(part.front_faces(_look(source, view, n)) is not None for n, part in enumerate(source.parts)) == 6
+    monkeypatch.setattr(DrawnPart, "front_faces", lambda *_: None)
+    drawn = source.render(view, time_ns=0).astype(int)
+    assert (np.abs(culled - drawn).max(axis=2) > 2).sum() <= 10  # back faces may show through at an outline's pixels
+
+
+def test_an_eye_in_a_solid_thing_sees_its_inside(context: Any, stack: PanelStack) -> None:
+    around = Thing(shapes.box((2.0, 2.0, 2.0)), "plain", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), lit=False)
+    source = ProceduralSource(Scene("inside", (around,)), stack=stack, context=context)
+    assert (source.render(panel_view(EYES["ahead"], stack.panel(1)), time_ns=0) == [255, 0, 0, 255]).all()
+
+
+def _look(source: ProceduralSource, view: View, part: int) -> _Look:
+    arranged = source._arranged(0)
+    return _Look(arranged.places[part], clip_from_stack(view, arranged.corners_m.reshape(-1, 3)), view)
