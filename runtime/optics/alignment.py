@@ -74,18 +74,21 @@ def align(stack: PanelStack, *, solved_for_m: F64, eyes_m: F64) -> Alignment:
     """
     if not (np.abs(solved_for_m).max() <= FARTHEST_M and np.abs(eyes_m).max() <= FARTHEST_M):  # also catches NaN
         return Alignment(_as_they_are(stack), "the eye positions are not finite")
-    old, new = _middle(solved_for_m), _middle(eyes_m)
-    share, limited = 1.0, ""
-    for most, least, why in _limits(stack, solved_for_m, eyes_m, old=old, new=new):
+    old_m, new_m = _middle(solved_for_m), _middle(eyes_m)
+    # This runs at every refresh, and plain floats are several times as fast as small arrays.
+    old, moved = old_m.tolist(), (new_m - old_m).tolist()
+    share, limit = 1.0, ""
+    for most, least, name in _limits(stack, solved_for_m[:, 0].tolist(), eyes_m[:, 0].tolist(), old=old, step=moved):
         # Each limit allows a fraction `share` of the movement if share · most <= least.
         reach = 0.0 if least < 0.0 else 1.0 if most <= least else least / most
         if reach < share:
-            share, limited = reach, why
+            share, limit = reach, name
+    limited = _reason(limit, stack, eyes_m, moved_m=float(np.linalg.norm(new_m - old_m))) if limit else ""
     if share == 0.0:
         return Alignment(_as_they_are(stack), limited)
-    step = (new - old) * share
-    maps = tuple(_solved_from_shown(stack, n, old=old, step=step) for n in range(stack.count))
-    return Alignment(maps, limited, parallax(stack, old_m=old, new_m=old + step))
+    step_m = (new_m - old_m) * share
+    maps = tuple(_solved_from_shown(stack, n, old=old, step=step_m.tolist()) for n in range(stack.count))
+    return Alignment(maps, limited, parallax(stack, old_m=old_m, new_m=old_m + step_m))
 
 
 def scale_and_shift(matrix: F64) -> tuple[float, float, float, float]:
@@ -154,52 +157,63 @@ def _as_they_are(stack: PanelStack) -> tuple[F64, ...]:
     return tuple(np.eye(3) for _ in range(stack.count))
 
 
-def _solved_from_shown(stack: PanelStack, index: int, *, old: F64, step: F64) -> F64:
+def _solved_from_shown(stack: PanelStack, index: int, *, old: list[float], step: list[float]) -> F64:
+    """Return a panel's (3, 3) scale and shift for a midpoint that moves from `old` by `step`, in metres."""
     raster, reference_m = stack.panel(index), reference_x_m(stack)
     distance_m, height_m = old[0] - raster.x_m, old[0] - reference_m
     now_m = distance_m + step[0]
     magnified = step[0] * (reference_m - raster.x_m) / (now_m * height_m)
-    shift_m = (raster.x_m - reference_m) / height_m * (old[1:] * step[0] - step[1:] * distance_m) / now_m
-    matrix = np.eye(3)
-    matrix[0, 0] = matrix[1, 1] = 1.0 + magnified
+    behind = (raster.x_m - reference_m) / height_m
+    right_m, up_m = (behind * (old[axis] * step[0] - step[axis] * distance_m) / now_m for axis in (1, 2))
     # Pixel coordinates start at the panel's top left corner, not at its centre.
-    matrix[0, 2] = (raster.left_m * magnified + shift_m[0]) / raster.pitch_u_m
-    matrix[1, 2] = -(raster.top_m * magnified + shift_m[1]) / raster.pitch_v_m
-    matrix += 0.0  # avoids negative zeros
-    return matrix
+    shift_u = (raster.left_m * magnified + right_m) / raster.pitch_u_m
+    shift_v = -(raster.top_m * magnified + up_m) / raster.pitch_v_m
+    scale = 1.0 + magnified
+    return np.array([[scale, 0.0, shift_u + 0.0], [0.0, scale, shift_v + 0.0], [0.0, 0.0, 1.0]])  # no negative zeros
 
 
 def _limits(
-    stack: PanelStack, solved_for_m: F64, eyes_m: F64, *, old: F64, new: F64
+    stack: PanelStack, solved_x_m: list[float], eyes_x_m: list[float], *, old: list[float], step: list[float]
 ) -> Iterator[tuple[float, float, str]]:
-    """Yield (most, least, why) for each of an alignment's limits.
+    """Yield (most, least, limit) for each of an alignment's limits.
 
-    A fraction `share` of the movement is allowed if share · most <= least. `why` is the message to report if the limit
-    is exceeded.
+    A fraction `share` of the movement is allowed if share · most <= least. `limit` is `left` or `right` for an eye's
+    distance, and the panel's number for its shift and scale.
+
+    Args:
+        solved_x_m: x of the left and right eye that the layers were solved for.
+        eyes_x_m: x of the current left and right eye.
+        old: Midpoint between the eyes that the layers were solved for.
+        step: Movement of the midpoint.
     """
     front_m = stack.x_m[-1]
-    for name, before, after in zip(("left", "right"), solved_for_m, eyes_m, strict=True):
-        room_m = before[0] - front_m - NEAREST_M
-        why = f"the {name} eye is {after[0] - front_m:.3g} m from the front panel, but the minimum is {NEAREST_M} m"
-        yield before[0] - after[0], room_m, why
+    for name, before_m, after_m in zip(("left", "right"), solved_x_m, eyes_x_m, strict=True):
+        room_m = before_m - front_m - NEAREST_M
+        yield before_m - after_m, room_m, name
         if room_m < 0.0:
             return
-    reference_m, step = reference_x_m(stack), new - old
-    moved_m = float(np.linalg.norm(step))
+    reference_m = reference_x_m(stack)
     for n, x_m in enumerate(stack.x_m):
         if x_m == reference_m:
             continue
-        why = (
-            f"the eyes are {moved_m:.3g} m from the position that the layers were solved for, which is too far "
-            f"to align panel {n}"
-        )
         distance_m, weight = old[0] - x_m, (x_m - reference_m) / (old[0] - reference_m)
         for axis, size_m in ((1, stack.width_m), (2, stack.height_m)):
             shift = abs(weight * (old[axis] * step[0] - step[axis] * distance_m))
-            yield shift - MOST_SHIFT * size_m * step[0], MOST_SHIFT * size_m * distance_m, why
+            yield shift - MOST_SHIFT * size_m * step[0], MOST_SHIFT * size_m * distance_m, str(n)
         larger, smaller = MOST_SCALE - 1.0, 1.0 / MOST_SCALE - 1.0
-        yield step[0] * (-weight - larger), larger * distance_m, why
-        yield step[0] * (weight + smaller), -smaller * distance_m, why
+        yield step[0] * (-weight - larger), larger * distance_m, str(n)
+        yield step[0] * (weight + smaller), -smaller * distance_m, str(n)
+
+
+def _reason(limit: str, stack: PanelStack, eyes_m: F64, *, moved_m: float) -> str:
+    """Return the message for an exceeded limit, named as by `_limits`."""
+    if limit in ("left", "right"):
+        distance_m = eyes_m[("left", "right").index(limit), 0] - stack.x_m[-1]
+        return f"the {limit} eye is {distance_m:.3g} m from the front panel, but the minimum is {NEAREST_M} m"
+    return (
+        f"the eyes are {moved_m:.3g} m from the position that the layers were solved for, which is too far "
+        f"to align panel {limit}"
+    )
 
 
 def _places(count: int, shown: int, *, scale: float, shift: float) -> tuple[NDArray[np.intp], F32]:

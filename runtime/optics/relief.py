@@ -74,24 +74,25 @@ def parallax(stack: PanelStack, *, old_m: F64, new_m: F64) -> Parallax | None:
     if stack.count % 2 == 0 or np.array_equal(old_m, new_m):
         return None
     middle = stack.panel(stack.count // 2)
-    old, new = old_m[0] - middle.x_m, new_m[0] - middle.x_m
-    k = old / new
-    drift_m, growth = k * new_m[1:] - old_m[1:], 1.0 - k
+    old, new = old_m.tolist(), new_m.tolist()
+    old_x_m, new_x_m = old[0] - middle.x_m, new[0] - middle.x_m
+    k = old_x_m / new_x_m
+    growth = 1.0 - k
     places, weights = [], []
     for n in range(stack.count):
         raster = stack.panel(n)
         # Project from this panel to the middle panel along rays from the new midpoint.
-        scale = (new_m[0] - middle.x_m) / (new_m[0] - raster.x_m)
-        matrix = np.diag([scale * raster.pitch_u_m / middle.pitch_u_m, scale * raster.pitch_v_m / middle.pitch_v_m, 1])
-        y_m, z_m = new_m[1:] + (np.array([raster.left_m, raster.top_m]) - new_m[1:]) * scale
-        matrix[0, 2], matrix[1, 2] = (y_m - middle.left_m) / middle.pitch_u_m, (middle.top_m - z_m) / middle.pitch_v_m
-        places.append(matrix)
-        weights.append((old_m[0] - raster.x_m) / (old_m[0] - middle.x_m) * middle.pitch_u_m / raster.pitch_u_m)
+        scale = new_x_m / (new[0] - raster.x_m)
+        y_m, z_m = new[1] + (raster.left_m - new[1]) * scale, new[2] + (raster.top_m - new[2]) * scale
+        u, v = (y_m - middle.left_m) / middle.pitch_u_m, (middle.top_m - z_m) / middle.pitch_v_m
+        across, down = scale * raster.pitch_u_m / middle.pitch_u_m, scale * raster.pitch_v_m / middle.pitch_v_m
+        places.append(np.array([[across, 0.0, u], [0.0, down, v], [0.0, 0.0, 1.0]]))
+        weights.append((old[0] - raster.x_m) / old_x_m * middle.pitch_u_m / raster.pitch_u_m)
     drift_px = (
-        float(drift_m[0] + growth * middle.left_m) / middle.pitch_u_m,
-        -float(drift_m[1] + growth * middle.top_m) / middle.pitch_v_m,
+        (k * new[1] - old[1] + growth * middle.left_m) / middle.pitch_u_m,
+        -(k * new[2] - old[2] + growth * middle.top_m) / middle.pitch_v_m,
     )
-    return Parallax(drift_px, float(growth), tuple(places), tuple(map(float, weights)))
+    return Parallax(drift_px, growth, tuple(places), tuple(weights))
 
 
 @dataclass(frozen=True, slots=True)
