@@ -13,6 +13,7 @@ import numpy as np
 from runtime.clock import NS_PER_S
 from runtime.config import TrackerSettings
 from runtime.eyes import imm
+from runtime.eyes.noise import NoiseWatch
 from runtime.eyes.plausibility import NOT_NEWER, reason_against
 from runtime.records import F64, EyePoints, EyesEstimate, EyesLabel
 
@@ -160,6 +161,7 @@ class Tracker:
         """
         self.settings = settings or TrackerSettings()
         self._panel_m, self._in_front_m = panel_m, in_front_m
+        self._measured = NoiseWatch()
         self._history: deque[_Shown] = deque(maxlen=HISTORY)
         self._other: _Other | None = None
         self._lost_ns: int | None = None
@@ -193,7 +195,11 @@ class Tracker:
         if why := reason_against(points.eyes_m, in_front_m=self._in_front_m):
             return why
         left, right = points.eyes_m
-        return self._take(_Sample(capture_ns, (left + right) / 2, (right - left) / 2, self._noise(points)))
+        sample = _Sample(capture_ns, (left + right) / 2, (right - left) / 2, self._noise(points))
+        refused = self._take(sample)
+        if not refused:
+            self._measured.add(sample.middle_m, sample.half_m, capture_ns=capture_ns)
+        return refused
 
     def forget(self) -> None:
         """Reset the tracker to its initial state."""
@@ -206,7 +212,8 @@ class Tracker:
 
         If the driver reports a covariance, it is raised to a minimum. Otherwise, the noise in the settings is used.
         """
-        noise: F64 = self.settings.noise_m**2 / 2 * np.eye(3)
+        sigma_m = self._measured.sigma_m if self._measured.sigma_m is not None else np.full(3, self.settings.noise_m)
+        noise: F64 = np.diag(sigma_m**2 / 2)
         if points.covariance_m2 is not None and np.isfinite(points.covariance_m2).all():
             variances, axes = np.linalg.eigh((points.covariance_m2 + points.covariance_m2.T) / 2)
             noise = (axes * np.maximum(variances, NOISE_FLOOR_M**2)) @ axes.T

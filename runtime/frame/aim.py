@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
 from runtime.clock import NS_PER_MS, NS_PER_S
-from runtime.frame.effort import HORIZON_S, Costs, EffortChooser, Outlook, candidates
+from runtime.frame.effort import HORIZON_S, Costs, EffortChooser, Outlook, candidates, spread_s
 from runtime.frame.run_state import RunState
 from runtime.frame.solver_host import SolverHost
 from runtime.frame.viewer import Viewer
@@ -18,6 +19,32 @@ SPEED_NS = NS_PER_S // 2  # time constant for the running mean of the head's squ
 REQUESTS_KEPT = 256
 CALM_M_S = 0.02  # a seated viewer's head sways more slowly than this; deliberate movements are faster
 WORTH = 0.995  # refine only if the expected error would fall below this share of the current error
+
+
+@dataclass(frozen=True, slots=True)
+class Slots:
+    """Refreshes at which a solution will be shown, given when it begins.
+
+    A refresh shows the latest solution that is complete when the refresh is composed.
+    """
+
+    photon_ns: int  # current refresh's display time
+    composed_ns: int  # when the current refresh was composed
+    begins_ns: int  # when the solution is expected to begin
+    period_ns: int
+
+    def middle_ns(self, cost_ns: int) -> int:
+        """Return the middle of the display times of a solution that takes `cost_ns`.
+
+        The next solution is assumed to begin when this one is complete, and to take as long.
+        """
+        first = max(self._refresh_after(cost_ns), 1)  # the current refresh is already composed
+        end = max(self._refresh_after(2 * cost_ns), first + 1)
+        return self.photon_ns + self.period_ns * (first + end - 1) // 2
+
+    def _refresh_after(self, cost_ns: int) -> int:
+        """Return how many refreshes later a solution is first shown that is complete `cost_ns` after `begins_ns`."""
+        return -(-(self.begins_ns + cost_ns - self.composed_ns) // self.period_ns)
 
 
 class Aim:
@@ -53,6 +80,8 @@ class Aim:
         shown: Solution | None,
         state: RunState,
         *,
+        composed_ns: int,
+        now_ns: int,
         flat_wanted: bool,
         paused: bool,
     ) -> SolveRequest:
@@ -63,16 +92,20 @@ class Aim:
             eyes: Eyes at the current refresh's display time.
             shown: The latest solution.
             state: The run's state.
+            composed_ns: When the current refresh was composed.
+            now_ns: When the request is posted.
             flat_wanted: True if the flat picture is shown or will be needed soon.
             paused: True if the operator has paused the picture.
         """
         self._learn(shown, eyes)
+        begins_ns = min(max(self._solver.free_ns(now_ns), now_ns), now_ns + self._period_ns)  # else replaced by then
+        slots = Slots(timing.photon_ns, composed_ns, begins_ns, self._period_ns)
         predictor, refined, costs = state.predictor, None, self._solver.costs
         whole = self._fixed or Effort(1, predictor.steps)
         effort, expected_m2 = whole, 0.0
         timed = tuple(by for by in predictor.reductions if by in costs.stages)  # a new model may lack timings
         if timed and eyes.eyes_m is not None and state.settings.model.effort == "auto":
-            outlook = self._outlook(timing, eyes)
+            outlook = self._outlook(slots, eyes)
             horizon_s = self._horizon_s(timing, speed_m_s=outlook(0.0).speed_m_s)
             error = self._shown_error(eyes, shown, time_ns=timing.photon_ns)
             period_ms = self._period_ns / NS_PER_MS
@@ -86,9 +119,9 @@ class Aim:
                 most = predictor.refined_steps
                 refined = self._refined(shown, most, costs, shown_error=error, horizon_s=horizon_s)
             cost_ms = costs.ms(effort)
-            expected_m2 = outlook(cost_ms).moved_m2(max(cost_ms, period_ms) / 1e3)
+            expected_m2 = outlook(cost_ms).moved_m2(spread_s(cost_ms, period_ms=period_ms))
         cost_ns = round(costs.ms(effort) * NS_PER_MS)
-        then_ns, then_m, label = self._eyes_then(timing, eyes, cost_ns=cost_ns)
+        then_ns, then_m, label = self._eyes_then(slots, eyes, cost_ns=cost_ns)
         self._expected[then_ns] = expected_m2
         while len(self._expected) > REQUESTS_KEPT:
             self._expected.pop(next(iter(self._expected)))
@@ -107,21 +140,13 @@ class Aim:
             self._learned = shown.number
             self._chooser.pictures.learn(shown.measures, shown.effort)
 
-    def _middle_ns(self, timing: FrameTiming, cost_ns: int) -> int:
-        """Return the middle of the interval during which a solution started now will be shown.
-
-        The solution is complete after `cost_ns`, appears half a period later on average, and stays on the panels until
-        the next one appears.
-        """
-        return timing.photon_ns + cost_ns + (self._period_ns + max(cost_ns, self._period_ns)) // 2
-
-    def _eyes_then(self, timing: FrameTiming, eyes: EyesEstimate, *, cost_ns: int) -> tuple[int, F64 | None, EyesLabel]:
+    def _eyes_then(self, slots: Slots, eyes: EyesEstimate, *, cost_ns: int) -> tuple[int, F64 | None, EyesLabel]:
         """Return the time to solve for, the eyes (2, 3) predicted for that time, and their label.
 
         The eyes are predicted at most `HORIZON_NS` beyond the display time.
         """
-        middle_ns = self._middle_ns(timing, cost_ns)
-        reach_ns = min(middle_ns, timing.photon_ns + HORIZON_NS)
+        middle_ns = slots.middle_ns(cost_ns)
+        reach_ns = min(middle_ns, slots.photon_ns + HORIZON_NS)
         then = self._viewer.ahead(reach_ns) if eyes.eyes_m is not None else eyes
         if then.eyes_m is None or eyes.eyes_m is None:
             return middle_ns, eyes.eyes_m, eyes.label
@@ -129,9 +154,9 @@ class Aim:
         share = moved_m2 / (moved_m2 + 2 * then.sigma_m**2) if moved_m2 > 0.0 and then.label != "rested" else 1.0
         return middle_ns, eyes.eyes_m + share * (then.eyes_m - eyes.eyes_m), then.label
 
-    def _outlook(self, timing: FrameTiming, eyes: EyesEstimate) -> Callable[[float], Outlook]:
-        near = self._viewer.ahead(timing.photon_ns + self._period_ns)
-        far = self._viewer.ahead(timing.photon_ns + HORIZON_NS)
+    def _outlook(self, slots: Slots, eyes: EyesEstimate) -> Callable[[float], Outlook]:
+        near = self._viewer.ahead(slots.photon_ns + self._period_ns)
+        far = self._viewer.ahead(slots.photon_ns + HORIZON_NS)
         if far.label == "rested":
             return lambda cost_ms: Outlook()
         if eyes.eyes_m is None or near.eyes_m is None or far.eyes_m is None:  # a lost head, soon given up
@@ -142,7 +167,7 @@ class Aim:
         growth_m = max(far.sigma_m - near.sigma_m, 0.0) / (HORIZON_NS - self._period_ns)
 
         def outlook(cost_ms: float) -> Outlook:
-            ahead_ns = self._middle_ns(timing, round(cost_ms * NS_PER_MS)) - timing.photon_ns
+            ahead_ns = slots.middle_ns(round(cost_ms * NS_PER_MS)) - slots.photon_ns
             sigma_m = near.sigma_m + growth_m * (ahead_ns - self._period_ns)
             beyond_s = max(ahead_ns - HORIZON_NS, 0) / NS_PER_S
             return Outlook(sigma_m, speed_m_s, beyond_s * speed_m_s)

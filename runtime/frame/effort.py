@@ -1,13 +1,14 @@
 """Choose the raster and number of steps so that each solution has the least expected error.
 
-A solution that takes c seconds to compute stays on the panels for T = max(c, refresh period), and is computed for the
-eye positions expected at the middle of this interval. Averaged over the interval, the squared error of the light at the
-true eyes is Q, the error for a still viewer, plus D, the error due to an outdated view (docs/mathematics.md, "Effort"):
+A solution that takes c seconds to compute is shown for about c/P refreshes, where P is the refresh period, and is
+computed for the eye positions expected at the middle of their display times. These times deviate from the middle by s,
+the root mean square. Averaged over the refreshes, the squared error of the light at the true eyes is Q, the error for a
+still viewer, plus D, the error due to an outdated view (docs/mathematics.md, "Effort"):
 
-    J = Q(raster, steps) + D(sqrt(2·sigma² + v²·T²/12 + l²), T/sqrt(12)),
+    J = Q(raster, steps) + D(sqrt(2·sigma² + v²·s² + l²), s),    s² = (max(c, P)² - P²)/12,
     D(d, t) = y / (1 + y/D_max),    y = a·d²/(d + d0) + b·t²
 
-Here sigma is the tracking error along each axis at the middle of the interval, v is the head's speed, and l is how far
+Here sigma is the tracking error along each axis at the middle time, v is the head's speed, and l is how far
 the head moves beyond the tracker's prediction horizon. All three are multiplied by one factor that makes the predicted
 displacements match the observed ones. The rates a and b describe how fast the picture changes as the head moves and as
 time passes, and D_max is half the picture's variance. All of a, b and D_max are measured on successive target pictures.
@@ -25,6 +26,7 @@ from dataclasses import dataclass, field
 from runtime.records import Effort, Measures
 
 SOLVING_STAGES = ("render", "prepare", "inference", "finish", "step")
+REST = "rest"  # time between two solutions that belongs to no stage, for measurements and for waking up
 HORIZON_S = 1.0  # how long head and content are assumed to continue as they are
 EQUAL = 1.03  # the fastest effort with a mean error at most this many times the lowest is chosen
 PREFERRED = 0.93  # another effort is chosen if its mean error is below this share of the current effort's
@@ -53,13 +55,13 @@ SCALE_M, SCALE_S = 5e-3, 0.1  # units of displacement and time used in fitting t
 class Costs:
     """Time taken by each kind of solution on this machine with this scene, in milliseconds."""
 
-    stages: Mapping[int, Mapping[str, float]]  # keyed by reduction, then stage in SOLVING_STAGES; `step`: one step
+    stages: Mapping[int, Mapping[str, float]]  # keyed by reduction, then stage or REST; `step`: one step
 
     def ms(self, effort: Effort) -> float:
         """Return how long a solution takes from start to complete layers, in milliseconds."""
         stages = self.stages.get(effort.reduction, {})
         steps = effort.steps - (effort.continued_from or 0)
-        begun = ("finish",) if effort.continued_from is not None else ("render", "prepare", "inference", "finish")
+        begun = ("finish", REST) if effort.continued_from is not None else (*SOLVING_STAGES[:-1], REST)
         return sum(stages.get(stage, 0.0) for stage in begun) + steps * stages.get("step", 0.0)
 
 
@@ -97,8 +99,8 @@ class CostBook:
         self._measured = {by: means for by, means in self._measured.items() if self._unused[by] < KEPT_SOLUTIONS}
         means = self._measured.setdefault(effort.reduction, {})
         steps = effort.steps - (effort.continued_from or 0)
-        for stage in SOLVING_STAGES:
-            if effort.continued_from is not None and stage not in ("finish", "step"):
+        for stage in (*SOLVING_STAGES, REST):
+            if effort.continued_from is not None and stage not in ("finish", "step", REST):
                 continue
             if stage == "step" and not steps:
                 continue
@@ -113,9 +115,11 @@ class CostBook:
         the two raster widths. Without this limit, a raster might never be chosen again if other work had slowed down
         its initial measurement.
         """
-        measured_ms = sum(sum(stages.values()) for stages in self._measured.values())
-        first_ms = sum(self.first.get(by, {}).get(s, 0.0) for by, stages in self._measured.items() for s in stages)
+        both = [(ms, self.first[by][s]) for by, of in self._measured.items() for s, ms in of.items() if s in self.first[by]]
+        measured_ms, first_ms = sum(ms for ms, _ in both), sum(ms for _, ms in both)
         scale = measured_ms / first_ms if first_ms > 0 and measured_ms > 0 else 1.0
+        latest = min(self._measured, key=self._unused.__getitem__, default=None)
+        rest_ms = 0.0 if latest is None else self._measured[latest].get(REST, 0.0)
         costs: dict[int, dict[str, float]] = {}
         finer: tuple[int, dict[str, float]] | None = None
         for by, first in sorted(self.first.items()):
@@ -123,7 +127,7 @@ class CostBook:
             if finer is not None:
                 most = {stage: ms * finer[0] / by for stage, ms in finer[1].items()}
                 costs[by] = {stage: min(ms, most.get(stage, ms)) for stage, ms in costs[by].items()}
-            costs[by] |= self._measured.get(by, {})
+            costs[by] |= {REST: rest_ms, **self._measured.get(by, {})}
             finer = by, costs[by]
         return Costs(costs)
 
@@ -136,13 +140,26 @@ class Outlook:
     speed_m_s: float = 0.0  # the head's speed
     lag_m: float = 0.0  # how far the head moves beyond the tracker's prediction horizon
 
-    def moved_m2(self, life_s: float) -> float:
+    def moved_m2(self, spread_s: float) -> float:
         """Return the mean squared distance from a solution's eyes to the true eyes, in m².
 
         Args:
-            life_s: How long the solution is shown, in seconds.
+            spread_s: RMS deviation of the solution's display times from their middle, in seconds (`spread_s`).
         """
-        return 2 * self.sigma_m**2 + (self.speed_m_s * life_s) ** 2 / 12 + self.lag_m**2
+        return 2 * self.sigma_m**2 + (self.speed_m_s * spread_s) ** 2 + self.lag_m**2
+
+
+def spread_s(cost_ms: float, *, period_ms: float) -> float:
+    """Return the RMS deviation, from their middle, of the display times of a solution, in seconds.
+
+    The display times of n refreshes deviate by the period times sqrt((n² - 1)/12). A solution is shown at one refresh
+    at least, and otherwise at as many as fit in the time taken by the next solution.
+
+    Args:
+        cost_ms: Time taken by a solution.
+        period_ms: The display's refresh period.
+    """
+    return float(max(cost_ms**2 - period_ms**2, 0.0) ** 0.5) / 12**0.5 / 1e3
 
 
 @dataclass(slots=True)
@@ -253,7 +270,7 @@ class EffortChooser:
         means: dict[Effort, float] = {}
         for effort in efforts:
             cost_ms = costs.ms(effort)
-            error = self.expected_error(effort, outlook(cost_ms), life_s=max(cost_ms, period_ms) / 1e3)
+            error = self.expected_error(effort, outlook(cost_ms), spread_s=spread_s(cost_ms, period_ms=period_ms))
             means[effort] = self.mean_error(error, cost_ms, shown_error=shown_error, horizon_s=horizon_s)
         least = min(means.values())
         best = min((effort for effort in means if means[effort] <= EQUAL * least), key=costs.ms)
@@ -272,8 +289,13 @@ class EffortChooser:
         waited = min(cost_ms / 1e3 / horizon_s, 0.9)
         return waited * shown_error + (1 - waited) * error + waited**2 / 2 * self.pictures.contrast
 
-    def expected_error(self, effort: Effort, outlook: Outlook, *, life_s: float) -> float:
-        """Return J, the mean squared light error while a solution is shown for `life_s` seconds."""
-        spread_s = life_s / 12**0.5
-        moved_m = (self.foresight.scale * outlook.moved_m2(life_s)) ** 0.5
+    def expected_error(self, effort: Effort, outlook: Outlook, *, spread_s: float) -> float:
+        """Return J, the mean squared light error while a solution is shown.
+
+        Args:
+            effort: The solution's effort.
+            outlook: Expected accuracy of its eyes.
+            spread_s: RMS deviation of its display times from their middle, in seconds.
+        """
+        moved_m = (self.foresight.scale * outlook.moved_m2(spread_s)) ** 0.5
         return self.pictures.own(effort) + self.pictures.stale(moved_m, spread_s)

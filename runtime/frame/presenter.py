@@ -214,7 +214,7 @@ class Presenter:
         self._receive(woke_ns)
         times.lap("sensor")
         eyes = self.viewer.at(timing.photon_ns)
-        news = self.solver.news()
+        composed_ns, news = self.clock.now_ns(), self.solver.news()
         frame, limited = self._compose(timing, eyes, news)
         times.lap("track")
         report, lost = self._present(frame)
@@ -227,6 +227,8 @@ class Presenter:
             eyes,
             news.solution,
             self.run_cell.state,
+            composed_ns=composed_ns,
+            now_ns=self.clock.now_ns(),
             flat_wanted=wants_flat(eyes, flat_asked=self.flat_asked, flatness=self._flatness.value),
             paused=self.paused,
         )

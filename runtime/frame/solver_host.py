@@ -51,6 +51,10 @@ class SolverHost(ABC):
         """Current solution costs."""
 
     @abstractmethod
+    def free_ns(self, now_ns: int) -> int:
+        """Return when the solver is expected to begin a request that is posted at `now_ns`."""
+
+    @abstractmethod
     def post(self, request: SolveRequest) -> None:
         """Request a solution, replacing any earlier request that has not been started."""
 
@@ -91,6 +95,10 @@ class SimulatedSolver(SolverHost):
     @property
     def costs(self) -> Costs:
         return self._parts.simulated_costs()
+
+    def free_ns(self, now_ns: int) -> int:
+        self._advance()
+        return now_ns if self._under_way is None else self._under_way[0]
 
     def post(self, request: SolveRequest) -> None:
         self._advance()

@@ -13,10 +13,10 @@ from dataclasses import replace
 
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock
 from runtime.errors import ContextLost, FatalError, PhasestackError, Stopped, TransientError
-from runtime.frame.effort import CostBook, Costs
+from runtime.frame.effort import REST, SOLVING_STAGES, CostBook, Costs
 from runtime.frame.solver import SolverUpdate
 from runtime.frame.solver_host import FIRST_REQUEST, SolverHost, SolverParts, Task, taken_in
-from runtime.records import SolveRequest
+from runtime.records import Effort, SolveRequest
 from runtime.support.background import SOLVER_NICENESS, ThreadAbandoned, abandon, begin, patience_s, set_niceness
 from runtime.support.memory import give_back
 from runtime.support.untrusted_input import LIMITS
@@ -40,6 +40,7 @@ class _Attempt:
         self.number, self.abandoned = number, threading.Event()
         self.ready = threading.Event()
         self.busy_since_ns = 0  # when the current step or task started; 0 while idle
+        self.effort: Effort | None = None  # effort of the current step
         self.is_at_task = False
         self.took_ns: deque[int] = deque(maxlen=LATE_STEPS)  # durations of the latest steps
         self.costs: CostBook | None = None  # solution costs measured on this machine with this scene
@@ -103,6 +104,13 @@ class SolverThread(SolverHost):
     @property
     def costs(self) -> Costs:
         return self._costs or Costs({})  # no costs are known if a run is stopped during startup
+
+    def free_ns(self, now_ns: int) -> int:
+        attempt, costs = self._attempt, self._costs
+        begun_ns, effort = attempt.busy_since_ns, attempt.effort
+        if not begun_ns or effort is None or costs is None:
+            return now_ns
+        return max(begun_ns + round(costs.ms(effort) * NS_PER_MS), now_ns)
 
     def post(self, request: SolveRequest) -> None:
         with self._lock:
@@ -243,13 +251,16 @@ class SolverThread(SolverHost):
         return request
 
     def _step(self, attempt: _Attempt, parts: SolverParts, request: SolveRequest) -> None:
+        attempt.effort = request.effort
         attempt.busy_since_ns = self._clock.now_ns()
         step = parts.step(request)
         attempt.took_ns.append(self._clock.now_ns() - attempt.busy_since_ns)
-        attempt.busy_since_ns = 0
+        attempt.busy_since_ns, attempt.effort = 0, None
         if self._publish(attempt, step) and step.solution is not None:
             assert attempt.costs is not None and step.solution.effort is not None
-            attempt.costs.learn(step.solution.effort, step.solution.stage_ms)
+            stages = step.solution.stage_ms
+            rest_ms = max(attempt.took_ns[-1] / NS_PER_MS - sum(stages.get(stage, 0.0) for stage in SOLVING_STAGES), 0.0)
+            attempt.costs.learn(step.solution.effort, {**stages, REST: rest_ms})
             self._costs = attempt.costs.costs()
 
     def _publish(self, attempt: _Attempt, step: SolverUpdate) -> bool:
