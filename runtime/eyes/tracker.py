@@ -6,6 +6,7 @@ import math
 from bisect import bisect_left
 from collections import deque
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -35,75 +36,73 @@ CLOCK_RESET_NS = NS_PER_S  # if a capture time is this far in the past, the cloc
 COMPLETED_NOISE = 2.0  # factor for the standard deviation of a pair of eyes if one eye's position is inferred
 NOISE_FLOOR_M = 2e-5  # smallest standard deviation accepted from a driver; no sensor measures pupils more precisely
 ESTABLISHED = 3  # a head with fewer samples than this may be a mistake
-SIGMA_AHEAD_S = 1.0  # uncertainty is extrapolated no further than this
+SIGMA_AHEAD_S = imm.LONGEST_S  # uncertainty is extrapolated no further than this
 NEAREST_M = 0.1  # minimum distance from the display to use when weighing depth errors
 PANEL_M = (0.5184, 0.2916)  # default panel width and height
 NO_JUMP = np.zeros((2, 3))
+# The filtered quantities: the midpoint of the eyes and the vector from the midpoint to the right eye.
+MODELS = imm.Models.of(ACCELERATION, TURN_ACCELERATION, stay_s=STAY_S)
+HEAD_FROM_EYES = np.array([[0.5, 0.5], [-0.5, 0.5]])
+EYES_FROM_HEAD = np.array([[1.0, -1.0], [1.0, 1.0]])
 
 UNCERTAIN = "uncertain"
 ELSEWHERE = "not where the viewer is"
 
 
-class _Head(NamedTuple):
+@dataclass(frozen=True)
+class _Head:
     """One head's estimated motion at the time of its newest sample."""
 
     capture_ns: int  # capture time of the newest sample
-    middle: imm.Belief  # midpoint of the eyes, frame `stack`
-    half: imm.Belief  # vector from the midpoint to the right eye
+    belief: imm.Belief  # midpoint of the eyes, frame `stack`, and vector from the midpoint to the right eye
     samples: int  # number of samples behind the estimate
     surprise: float  # chi² of the newest sample
+
+    @cached_property
+    def moments(self) -> imm.Moments:
+        return imm.moments(self.belief, models=MODELS)
 
     def age_s(self, time_ns: int) -> float:
         return (time_ns - self.capture_ns) / NS_PER_S
 
     def eyes_m(self, ahead_s: float) -> F64:
         """Return the (2, 3) left and right eye `ahead_s` seconds after the newest sample."""
-        middle, half = imm.ahead(self.middle, ahead_s), imm.ahead(self.half, ahead_s)
-        return np.array([middle - half, middle + half])
+        eyes_m: F64 = EYES_FROM_HEAD @ imm.ahead(self.moments, ahead_s)
+        return eyes_m
 
 
 class _Sample(NamedTuple):
     """A measurement that has passed the plausibility checks."""
 
     capture_ns: int
-    middle_m: F64  # (3,) midpoint of the eyes, frame `stack`
-    half_m: F64  # (3,) vector from the midpoint to the right eye
-    noise_m2: F64  # (3, 3) covariance of `middle_m`, and also of `half_m`
+    head_m: F64  # (2, 3) midpoint of the eyes, frame `stack`, and vector from the midpoint to the right eye
+    noise_m2: F64  # (3, 3) covariance of each row of `head_m`
 
     def begun(self) -> _Head:
         """Return a new head estimated from this sample alone."""
-        middle = imm.started(self.middle_m, noise=self.noise_m2, speed=FIRST_SPEED, acceleration=ACCELERATION)
-        half = imm.started(self.half_m, noise=self.noise_m2, speed=FIRST_SPEED / 3, acceleration=TURN_ACCELERATION)
-        return _Head(self.capture_ns, middle, half, 1, 0.0)
+        belief = imm.started(self.head_m, noise=self.noise_m2, speeds=(FIRST_SPEED, FIRST_SPEED / 3), models=MODELS)
+        return _Head(self.capture_ns, belief, 1, 0.0)
 
     def continued(self, head: _Head) -> _Head | None:
         """Return a head updated with this sample, or None if the sample cannot belong to it."""
         age_s = head.age_s(self.capture_ns)
         if age_s > KEEP_S:
             return None
-        middle = imm.predicted(head.middle, age_s, acceleration=ACCELERATION, stay_s=STAY_S)
-        half = imm.predicted(head.half, age_s, acceleration=TURN_ACCELERATION, stay_s=STAY_S)
-        surprise = max(
-            imm.surprise(middle, self.middle_m, noise=self.noise_m2),
-            imm.surprise(half, self.half_m, noise=self.noise_m2),
-        )
+        expected = imm.predicted(head.belief, age_s, models=MODELS)
+        seen = imm.innovation(expected, self.head_m, noise=self.noise_m2, models=MODELS)
+        surprise = imm.surprise(seen, models=MODELS)
         if surprise > CHI2_GATE:
             return None
-        return _Head(
-            self.capture_ns,
-            imm.corrected(middle, self.middle_m, noise=self.noise_m2),
-            imm.corrected(half, self.half_m, noise=self.noise_m2),
-            head.samples + 1,
-            surprise,
-        )
+        belief = imm.corrected(expected, seen, models=MODELS)
+        return _Head(self.capture_ns, belief, head.samples + 1, surprise)
 
     def is_within_reach_of(self, head: _Head) -> bool:
         """Return True if a head could have moved to this sample's position since its own newest sample."""
         age_s = head.age_s(self.capture_ns)
         reach_m = min(REACH_SPEED * age_s, REACH_ACCELERATION * age_s**2 / 2)
-        noise_m = math.sqrt(np.trace(self.noise_m2 + head.middle.covariance[0, :3, :3]))
-        expected_m = imm.ahead(head.middle, min(age_s, HORIZON_S))
-        return bool(np.linalg.norm(self.middle_m - expected_m) <= reach_m + 4 * noise_m)
+        noise_m = math.sqrt(np.trace(self.noise_m2 + head.belief.covariance[0, :3, :3]))
+        off_m = self.head_m - imm.ahead(head.moments, min(age_s, HORIZON_S))
+        return bool(np.linalg.norm(off_m[0]) <= reach_m + 4 * noise_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,8 +191,7 @@ class Tracker:
             return UNCERTAIN
         if why := reason_against(points.eyes_m, in_front_m=self._in_front_m):
             return why
-        left, right = points.eyes_m
-        return self._take(_Sample(capture_ns, (left + right) / 2, (right - left) / 2, self._noise(points)))
+        return self._take(_Sample(capture_ns, HEAD_FROM_EYES @ points.eyes_m, self._noise(points)))
 
     def forget(self) -> None:
         """Reset the tracker to its initial state."""
@@ -321,12 +319,11 @@ class Tracker:
     def _estimate(self, time_ns: int, head: _Head, eyes_m: F64, label: EyesLabel) -> EyesEstimate:
         """Return the estimate for `eyes_m`, with a standard deviation that has grown since the sample."""
         age_s = min(max(head.age_s(time_ns), 0.0), SIGMA_AHEAD_S)
-        middle_m, half_m = (eyes_m[0] + eyes_m[1]) / 2, (eyes_m[1] - eyes_m[0]) / 2
-        if label in ("exact", "interpolated"):
-            middle_m, half_m = imm.ahead(head.middle, 0.0), imm.ahead(head.half, 0.0)
-        error_m2 = imm.spread(head.middle, age_s, acceleration=ACCELERATION, about=middle_m)
-        error_m2 += imm.spread(head.half, age_s, acceleration=TURN_ACCELERATION, about=half_m)
-        sigma_m = sideways_sigma_m(error_m2, middle_m, panel_m=self._panel_m)
+        is_past = label in ("exact", "interpolated")
+        head_m: F64 = head.moments.mean[:, 0] if is_past else HEAD_FROM_EYES @ eyes_m
+        off_m = imm.ahead(head.moments, age_s) - head_m
+        error_m2 = imm.spread(head.moments, age_s) + off_m.T @ off_m  # an eye is the midpoint plus or minus the vector
+        sigma_m = sideways_sigma_m(error_m2, head_m[0], panel_m=self._panel_m)
         return EyesEstimate(time_ns, head.capture_ns, eyes_m, label, sigma_m)
 
 
@@ -342,7 +339,9 @@ def sideways_sigma_m(error_m2: F64, eye_m: F64, *, panel_m: tuple[float, float])
         eye_m: (3,) position of the eyes' midpoint in frame `stack`.
         panel_m: Panel width and height.
     """
-    x, y, z = max(float(eye_m[0]), NEAREST_M), float(eye_m[1]), float(eye_m[2])
+    x, y, z = eye_m.tolist()
+    x = max(x, NEAREST_M)
+    (xx, xy, xz), (_, yy, _), (_, _, zz) = error_m2.tolist()
     lever2 = (y * y + z * z + (panel_m[0] ** 2 + panel_m[1] ** 2) / 12) / (x * x)
-    both = error_m2[1, 1] + error_m2[2, 2] - 2 * (y * error_m2[0, 1] + z * error_m2[0, 2]) / x
-    return math.sqrt(max(float(both + lever2 * error_m2[0, 0]), 0.0) / 2)
+    both = yy + zz - 2 * (y * xy + z * xz) / x
+    return math.sqrt(max(both + lever2 * xx, 0.0) / 2)
