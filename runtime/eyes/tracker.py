@@ -204,10 +204,13 @@ class Tracker:
 
         If the driver reports a covariance, it is raised to a minimum. Otherwise, the noise in the settings is used.
         """
-        noise: F64 = self.settings.noise_m**2 / 2 * np.eye(3)
         if points.covariance_m2 is not None and np.isfinite(points.covariance_m2).all():
-            variances, axes = np.linalg.eigh((points.covariance_m2 + points.covariance_m2.T) / 2)
-            noise = (axes * np.maximum(variances, NOISE_FLOOR_M**2)) @ axes.T
+            noise: F64 = (points.covariance_m2 + points.covariance_m2.T) / 2
+            if not _exceeds(noise, NOISE_FLOOR_M**2):
+                variances, axes = np.linalg.eigh(noise)
+                noise = (axes * np.maximum(variances, NOISE_FLOOR_M**2)) @ axes.T
+        else:
+            noise = self.settings.noise_m**2 / 2 * np.eye(3)
         return noise * COMPLETED_NOISE**2 if points.completed else noise
 
     def _take(self, sample: _Sample) -> str:
@@ -217,11 +220,15 @@ class Tracker:
         last = self._history[-1]
         age_s = last.head.age_s(sample.capture_ns)
         is_held = self._lost_ns is not None or age_s > HORIZON_S
+        head = sample.continued(last.head)
+        if head is not None and head.surprise <= CHI2_DOUBT:
+            self._follow(head, is_return=is_held)
+            return ""
         known = self._other
         again = sample.continued(known.head) if known is not None else None
-        if head := sample.continued(last.head):
+        if head is not None:
             is_others = again is not None and again.surprise < head.surprise and not (known and known.may_be_viewer)
-            if head.surprise <= CHI2_DOUBT or not is_others:
+            if not is_others:
                 self._follow(head, is_return=is_held)
                 return ""
         if known is not None and again is not None:
@@ -325,6 +332,17 @@ class Tracker:
         error_m2 = imm.spread(head.moments, age_s) + off_m.T @ off_m  # an eye is the midpoint plus or minus the vector
         sigma_m = sideways_sigma_m(error_m2, head_m[0], panel_m=self._panel_m)
         return EyesEstimate(time_ns, head.capture_ns, eyes_m, label, sigma_m)
+
+
+def _exceeds(covariance: F64, variance: float) -> bool:
+    """Return True if a (3, 3) covariance has a larger variance than the given one in every direction.
+
+    By Sylvester's criterion, it has if the leading minors of the difference are positive.
+    """
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = covariance.tolist()
+    xx, yy, zz = xx - variance, yy - variance, zz - variance
+    minor = xx * yy - xy * xy
+    return bool(xx > 0 and minor > 0 and zz * minor + 2 * xy * xz * yz - xx * yz * yz - yy * xz * xz > 0)
 
 
 def sideways_sigma_m(error_m2: F64, eye_m: F64, *, panel_m: tuple[float, float]) -> float:
