@@ -6,6 +6,9 @@ become a fast one within a tenth of a second. The measurement noise is a covaria
 positions to the right and up twenty times as precisely as depth.
 
 A state has nine numbers: position, velocity and acceleration along x, y and z, in metres and seconds.
+
+Quantities that are measured at the same time are filtered together, with all their models stacked along the first axis.
+For arrays this small, numpy's time depends on the number of calls, hardly on the number of models.
 """
 
 from __future__ import annotations
@@ -16,14 +19,46 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from runtime.records import F64
 
 FADE_S = 0.25  # time for an acceleration to decay by a factor of e
-ROUNDING = 1e-12  # share of a covariance's trace to add to its diagonal: (10 nm)² for a head's (1 cm)²
+LONGEST_S = 1.0  # longest time step
+TERMS = 50  # number of terms in the power series; their relative error is 1e-12 after the longest time step
 WEIGHT_FLOOR = 1e-6  # minimum probability of each model, so that it can recover
-_NODES, _SHARES = np.polynomial.legendre.leggauss(10)
+JITTER = 1e-12  # relative increase of all variances if rounding has made a covariance indefinite, by less than 1e-14
+BEYOND = 1e30  # larger than any innovation's squared Mahalanobis length
 _AXES = np.eye(3)
+_EXPONENTS = np.arange(float(TERMS))
+
+
+class Models(NamedTuple):
+    """Motion models of one or more quantities, stacked."""
+
+    quantity: NDArray[np.intp]  # (models,) index of the quantity that a model is for, in ascending order
+    first: NDArray[np.intp]  # (quantities,) index of the quantity's first model
+    variance: F64  # (models,) variance of the acceleration along each axis, in m²/s⁴
+    switched: F64  # (models, models) probability of ending with each model, in the limit of many switches
+    unswitched: F64  # (models, models) difference from `switched` in the limit of no switches
+    stay_s: float  # mean time that a model applies before the motion switches to another
+
+    @classmethod
+    def of(cls, *accelerations: Sequence[float], stay_s: float) -> Models:
+        """Stack the models of one or more quantities.
+
+        Args:
+            accelerations: For each quantity, the standard deviation of each model's acceleration along each axis, in
+                m/s².
+            stay_s: Mean time that a model applies before the motion switches to another.
+        """
+        counts = [len(models) for models in accelerations]
+        quantity = np.repeat(np.arange(len(counts)), counts)
+        same = np.equal.outer(quantity, quantity)
+        switched = same / same.sum(axis=0)
+        variance = np.square(np.concatenate(accelerations))
+        first = np.searchsorted(quantity, np.arange(len(counts)))
+        return cls(quantity, first, variance, switched, np.eye(len(quantity)) - switched, stay_s)
 
 
 class Belief(NamedTuple):
@@ -31,159 +66,195 @@ class Belief(NamedTuple):
 
     state: F64  # (models, 9)
     covariance: F64  # (models, 9, 9)
-    weight: F64  # (models,) probabilities that add up to 1
+    weight: F64  # (models,) probabilities; those of a quantity's models add up to 1
 
 
-def _response(times_s: F64) -> F64:
-    """Return the (3, n) position, velocity and acceleration caused by a unit acceleration at time 0."""
-    x = times_s / FADE_S
-    gone = -np.expm1(-x)
-    return np.array([FADE_S**2 * (x - gone), FADE_S * gone, 1 - gone])
+class Innovation(NamedTuple):
+    """Difference between a measurement and each model's prediction."""
+
+    chi2: F64  # (models,) squared Mahalanobis lengths
+    factor: F64  # (models, 13, 13) Cholesky factors, see `innovation`
 
 
-def _of_each_axis(matrix: F64) -> F64:
-    """Return the (9, 9) matrix that applies a (3, 3) matrix to x, y and z separately."""
-    return (matrix[:, None, :, None] * _AXES[:, None, :]).reshape(9, 9)
+class Moments(NamedTuple):
+    """Moments of the quantities' states, with the models weighted by their probabilities."""
+
+    mean: F64  # (quantities, 3, 3) mean position, velocity and acceleration, by row
+    # (10, 9) sums over the quantities, for each pair of axes by column: the covariances of each pair of derivatives,
+    # and the variance of the acceleration.
+    covariance: F64
 
 
-@lru_cache(maxsize=8)
-def _transition(dt_s: float) -> F64:
-    """Return the (9, 9) matrix that maps a state to the expected state `dt_s` later."""
-    step = np.eye(3)
-    step[0, 1] = dt_s
-    step[:, 2] = _response(np.array([dt_s]))[:, 0]
-    return _of_each_axis(step)
+def _products(series: F64) -> F64:
+    """Return the (n, n, TERMS) products of all pairs of (n, TERMS) power series."""
+    return np.array([[np.convolve(one, other)[:TERMS] for other in series] for one in series])
 
 
-@lru_cache(maxsize=8)
-def _noise(dt_s: float) -> F64:
-    """Return the (9, 9) covariance added to a state in `dt_s` by an acceleration noise of 1 m/s².
+def _series() -> tuple[F64, F64]:
+    """Return the (18, TERMS) coefficients of `_motion` for one axis and the (13, TERMS) coefficients of `_outlook`.
 
-    1 m/s² is the noise's standard deviation. The covariance is integrated by Gauss-Legendre quadrature, because the
-    closed form suffers from cancellation.
+    The variable of these power series is the time divided by `FADE_S`. Closed forms would suffer from cancellation.
     """
-    response = _response(dt_s * (_NODES + 1) / 2)
-    return _of_each_axis((response * (_SHARES * dt_s / FADE_S)) @ response.T)
+    power = np.arange(TERMS)
+    decay = np.cumprod(np.r_[1.0, -1.0 / power[1:]])  # exp(-x)
+    # Position, velocity and acceleration caused by a unit acceleration at time 0.
+    response = np.array([FADE_S**2 * decay * (power > 1), -FADE_S * decay * (power > 0), decay])
+    step, noise = np.zeros((2, 3, 3, TERMS))
+    step[0, 0, 0] = step[1, 1, 0] = 1.0
+    step[0, 1, 1] = FADE_S
+    step[:, 2] = response
+    noise[..., 1:] = 2 * _products(response)[..., :-1] / power[1:]  # integral from 0 to x
+    weights = [*step[0], *_products(step[0]).reshape(9, TERMS), noise[0, 0]]
+    return np.array([step, noise]).reshape(18, TERMS), np.array(weights)
 
 
-def started(place: F64, *, noise: F64, speed: float, acceleration: Sequence[float]) -> Belief:
+_MOTION, _POSITION = _series()
+
+
+def _powers(dt_s: float) -> F64:
+    """Return the (TERMS,) powers of a time step in the power series."""
+    if not 0 <= dt_s <= LONGEST_S:
+        raise ValueError(f"a time step must be from 0 to {LONGEST_S} s, not {dt_s}")
+    powers: F64 = (dt_s / FADE_S) ** _EXPONENTS
+    return powers
+
+
+@lru_cache(maxsize=8)  # a simulated sensor's time steps recur
+def _motion(dt_s: float) -> F64:
+    """Return two (9, 9) matrices for the motion in `dt_s`.
+
+    The first one maps a state to the expected state. The second one is the covariance added by an acceleration noise
+    with a standard deviation of 1 m/s².
+    """
+    along_one_axis = (_MOTION @ _powers(dt_s)).reshape(2, 3, 1, 3, 1)
+    return (along_one_axis * _AXES[:, None, :]).reshape(2, 9, 9)
+
+
+@lru_cache(maxsize=8)  # one prediction asks several times for the same time step
+def _outlook(dt_s: float) -> tuple[F64, F64]:
+    """Return the weights of `Moments.mean`'s rows, (3,), and of `Moments.covariance`'s, (10,), for `dt_s` ahead."""
+    weights = _POSITION @ _powers(dt_s)
+    return weights[:3], weights[3:]
+
+
+def started(places: F64, *, noise: F64, speeds: Sequence[float], models: Models) -> Belief:
     """Return the belief after a first measurement, with a mean velocity of zero.
 
     Args:
-        place: (3,) measured position.
-        noise: (3, 3) covariance of the measurement.
-        speed: Standard deviation of the velocity along each axis, in m/s.
-        acceleration: Standard deviation of each model's acceleration along each axis, in m/s².
+        places: (quantities, 3) measured positions.
+        noise: (3, 3) covariance of each measured position.
+        speeds: Standard deviation of each quantity's velocity along each axis, in m/s.
+        models: The quantities' models.
     """
-    count = len(acceleration)
+    count = len(models.quantity)
     state, covariance = np.zeros((count, 9)), np.zeros((count, 9, 9))
-    state[:, :3] = place
+    state[:, :3] = places[models.quantity]
     covariance[:, :3, :3] = noise
-    covariance[:, 3:6, 3:6] = speed**2 * _AXES
-    covariance[:, 6:, 6:] = np.square(acceleration)[:, None, None] * _AXES
-    return Belief(state, covariance, np.full(count, 1 / count))
+    covariance[:, 3:6, 3:6] = np.square(speeds)[models.quantity, None, None] * _AXES
+    covariance[:, 6:, 6:] = models.variance[:, None, None] * _AXES
+    return Belief(state, covariance, models.switched.diagonal())
 
 
-def predicted(belief: Belief, dt_s: float, *, acceleration: Sequence[float], stay_s: float) -> Belief:
+def predicted(belief: Belief, dt_s: float, *, models: Models) -> Belief:
     """Return the belief after a time step. The models are first mixed, then propagated.
 
     Args:
-        dt_s: Length of the time step, which must not be negative.
-        acceleration: Standard deviation of each model's acceleration along each axis, in m/s².
-        stay_s: Mean time that a model applies before the motion switches to another.
+        dt_s: Length of the time step, from 0 to LONGEST_S.
+        models: The belief's models.
     """
-    count = len(belief.weight)
-    leave = -math.expm1(-dt_s / stay_s) / count  # probability of switching to each model, including this one
-    change = np.full((count, count), leave) + (1 - count * leave) * np.eye(count)
-    shares = belief.weight[:, None] * change
-    weight = shares.sum(0)
-    shares = shares / weight
-    mean = shares.T @ belief.state
-    apart = belief.state[:, None] - mean
-    covariance = np.tensordot(shares.T, belief.covariance, 1)
-    apart = apart.transpose(1, 2, 0)  # (into, 9, from)
-    covariance += (apart * shares.T[:, None]) @ apart.transpose(0, 2, 1)
-    step = _transition(dt_s)
-    added = np.square(acceleration)[:, None, None] * _noise(dt_s)
-    return Belief(mean @ step.T, step @ covariance @ step.T + added, weight)
+    change = models.switched + math.exp(-dt_s / models.stay_s) * models.unswitched
+    weight = change @ belief.weight
+    shares = change * belief.weight / weight[:, None]  # (into, from)
+    mean = shares @ belief.state
+    apart = belief.state - mean[:, None]  # (into, from, 9)
+    covariance = (shares @ belief.covariance.reshape(-1, 81)).reshape(-1, 9, 9)
+    covariance += (apart * shares[:, :, None]).transpose(0, 2, 1) @ apart
+    step, noise = _motion(dt_s)
+    covariance = step @ covariance @ step.T + models.variance[:, None, None] * noise
+    return Belief(mean @ step.T, covariance, weight)
 
 
-def surprise(belief: Belief, measured: F64, *, noise: F64) -> float:
-    """Return the squared Mahalanobis distance from a (3,) measurement to the nearest model.
+def innovation(belief: Belief, measured: F64, *, noise: F64, models: Models) -> Innovation:
+    """Compare a measurement with each model's prediction.
 
-    For a good measurement and the right model, this has a chi² distribution with three degrees of freedom.
+    The joint covariance of measurement and state has a Cholesky factor with three parts: the measurement's factor, the
+    gain times this factor, and the factor of the corrected state's covariance, which thus stays positive definite. One
+    more row of the factor becomes the innovation in units of the measurement's factor.
 
     Args:
-        noise: (3, 3) covariance of the measurement.
+        belief: The prediction.
+        measured: (quantities, 3) measured positions.
+        noise: (3, 3) covariance of each measured position.
+        models: The belief's models.
     """
-    return float(_chi2(measured - belief.state[:, :3], _total(belief, noise)).min())
+    joint = np.zeros((len(models.quantity), 13, 13))
+    joint[:, :3, :3] = belief.covariance[:, :3, :3] + noise
+    joint[:, 3:12, :3] = belief.covariance[:, :, :3]
+    joint[:, 3:12, 3:12] = belief.covariance
+    joint[:, 12, :3] = measured[models.quantity] - belief.state[:, :3]
+    joint[:, 12, 12] = BEYOND
+    factor = _cholesky(joint)
+    off = factor[:, 12, :3]
+    return Innovation(np.vecdot(off, off), factor)
 
 
-def _total(belief: Belief, noise: F64) -> F64:
-    """Return the innovation's (n, 3, 3) covariances, regularized against rounding after a long jump."""
-    total = belief.covariance[:, :3, :3] + noise
-    spread: F64 = np.trace(total, axis1=1, axis2=2)[:, None, None] * ROUNDING
-    return np.asarray(total + spread * np.eye(3), np.float64)
+def _cholesky(covariance: F64) -> F64:
+    """Return the lower Cholesky factors of (n, k, k) covariances, of which the upper triangles are not used.
+
+    After a long jump, rounding can make a covariance indefinite. All variances are then raised.
+    """
+    try:
+        factor = np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:
+        factor = np.linalg.cholesky(covariance * (1 + JITTER * np.eye(covariance.shape[1])))
+    return np.asarray(factor, np.float64)
 
 
-def _chi2(off: F64, covariance: F64) -> F64:
-    """Return the (n,) squared Mahalanobis lengths of (n, 3) vectors with (n, 3, 3) covariances."""
-    result: F64 = (off * np.linalg.solve(covariance, off[..., None])[..., 0]).sum(1)
-    return result
+def surprise(seen: Innovation, *, models: Models) -> float:
+    """Return the squared Mahalanobis distance from the most surprising quantity to its nearest model.
+
+    For a good measurement of one quantity and the right model, this has a chi² distribution with three degrees of
+    freedom.
+    """
+    return float(np.minimum.reduceat(seen.chi2, models.first).max())
 
 
-def corrected(belief: Belief, measured: F64, *, noise: F64) -> Belief:
+def corrected(belief: Belief, seen: Innovation, *, models: Models) -> Belief:
     """Return the belief after a measurement.
 
     Args:
-        measured: (3,) measured position.
-        noise: (3, 3) covariance of the measurement.
+        belief: The prediction.
+        seen: Difference between the measurement and the prediction.
+        models: The belief's models.
     """
-    total = _total(belief, noise)
-    gain = np.linalg.solve(total, belief.covariance[:, :3, :]).transpose(0, 2, 1)
-    off = measured - belief.state[:, :3]
-    likely = -0.5 * (_chi2(off, total) + np.linalg.slogdet(total)[1])
-    weight = belief.weight * np.exp(likely - likely.max()) + WEIGHT_FLOOR
-    # Joseph's form keeps variances positive despite rounding.
-    keep = np.repeat(np.eye(9)[None], len(weight), axis=0)
-    keep[:, :, :3] -= gain
-    covariance = keep @ belief.covariance @ keep.transpose(0, 2, 1) + gain @ noise @ gain.transpose(0, 2, 1)
-    state = belief.state + (gain @ off[..., None])[..., 0]
-    return Belief(state, _positive((covariance + covariance.transpose(0, 2, 1)) / 2), weight / weight.sum())
+    gain, rest, off = seen.factor[:, 3:12, :3], seen.factor[:, 3:12, 3:12], seen.factor[:, 12, :3]
+    state = belief.state + (gain @ off[:, :, None])[:, :, 0]
+    likely = -0.5 * seen.chi2 - np.log(seen.factor.diagonal(axis1=1, axis2=2)[:, :3]).sum(axis=1)
+    likely -= np.maximum.reduceat(likely, models.first)[models.quantity]
+    weight = belief.weight * np.exp(likely) + WEIGHT_FLOOR
+    weight /= np.add.reduceat(weight, models.first)[models.quantity]
+    return Belief(state, rest @ rest.transpose(0, 2, 1), weight)
 
 
-def _positive(covariance: F64) -> F64:
-    """Return (n, 9, 9) covariances with all eigenvalues made positive.
-
-    After a long jump, rounding can make an eigenvalue negative.
-    """
-    try:
-        np.linalg.cholesky(covariance)
-    except np.linalg.LinAlgError:
-        size = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 1e-12))
-        scale = size[:, :, None] * size[:, None, :]
-        shares, axes = np.linalg.eigh(covariance / scale)
-        covariance = scale * ((axes * np.maximum(shares, 1e-9)[:, None]) @ axes.transpose(0, 2, 1))
-    return covariance
+def moments(belief: Belief, *, models: Models) -> Moments:
+    """Return the moments of the quantities' states, with the models weighted by their probabilities."""
+    share = belief.weight[:, None]
+    mean = np.add.reduceat(share * belief.state, models.first)
+    apart = belief.state - mean[models.quantity]
+    spread = (belief.weight @ belief.covariance.reshape(-1, 81)).reshape(9, 9) + (share * apart).T @ apart
+    covariance = np.empty((10, 9))
+    covariance[:9] = spread.reshape(3, 3, 3, 3).transpose(0, 2, 1, 3).reshape(9, 9)
+    covariance[9] = (belief.weight @ models.variance) * _AXES.ravel()
+    return Moments(mean.reshape(-1, 3, 3), covariance)
 
 
-def ahead(belief: Belief, dt_s: float) -> F64:
-    """Return the expected (3,) position `dt_s` later, weighting the models by their probabilities."""
-    position: F64 = _transition(dt_s)[:3] @ (belief.weight @ belief.state)
+def ahead(now: Moments, dt_s: float) -> F64:
+    """Return the quantities' expected (quantities, 3) positions after a time step from 0 to LONGEST_S."""
+    position: F64 = _outlook(dt_s)[0] @ now.mean
     return position
 
 
-def spread(belief: Belief, dt_s: float, *, acceleration: Sequence[float], about: F64) -> F64:
-    """Return the (3, 3) second moment, about a given point, of the position after a time step, in m².
-
-    Args:
-        dt_s: Length of the time step.
-        acceleration: Standard deviation of each model's acceleration along each axis, in m/s².
-        about: (3,) point.
-    """
-    step = _transition(dt_s)[:3]
-    added = np.square(acceleration)[:, None, None] * _noise(dt_s)[:3, :3]
-    apart = belief.state @ step.T - about
-    each = step @ belief.covariance @ step.T + added + apart[:, :, None] * apart[:, None, :]
-    result: F64 = np.tensordot(belief.weight, each, 1)
-    return result
+def spread(now: Moments, dt_s: float) -> F64:
+    """Return the sum of the positions' (3, 3) covariances, in m², after a time step from 0 to LONGEST_S."""
+    covariance: F64 = (_outlook(dt_s)[1] @ now.covariance).reshape(3, 3)
+    return covariance

@@ -7,6 +7,8 @@ positions cancels the polynomial and leaves the noise.
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 
 from runtime.clock import NS_PER_S
@@ -29,28 +31,26 @@ class NoiseWatch:
 
     def __init__(self) -> None:
         self.sigma_m: F64 | None = None  # (3,) standard deviation of one eye along x, y and z; None: not yet known
-        self._times_ns: list[int] = []  # capture times of the newest samples, at most WINDOW
-        self._places: list[F64] = []  # (2, 3) midpoint and half vector of each of these samples
+        self._newest: deque[tuple[int, F64]] = deque(maxlen=WINDOW)  # capture times and samples
         self._differences = np.zeros((KEPT, 2, 3))
         self._count = 0  # differences so far
 
-    def add(self, middle_m: F64, half_m: F64, *, capture_ns: int) -> None:
+    def add(self, head_m: F64, *, capture_ns: int) -> None:
         """Add an accepted sample and update `sigma_m`.
 
         Args:
-            middle_m: (3,) midpoint of the eyes.
-            half_m: (3,) vector from the midpoint to the right eye.
+            head_m: (2, 3) midpoint of the eyes, and vector from the midpoint to the right eye.
             capture_ns: The sample's capture time.
         """
-        self._times_ns, self._places = [*self._times_ns, capture_ns][-WINDOW:], [*self._places, np.stack([middle_m, half_m])][-WINDOW:]
-        span_ns = capture_ns - self._times_ns[0]
-        if len(self._times_ns) < WINDOW or not 0 < span_ns <= LONGEST_NS:
+        self._newest.append((capture_ns, head_m))
+        if len(self._newest) < WINDOW or not 0 < capture_ns - self._newest[0][0] <= LONGEST_NS:
             return
-        self._differences[self._count % KEPT] = np.tensordot(_weights(self._times_ns), np.stack(self._places), 1)
+        weights = _weights([time_ns for time_ns, _ in self._newest])
+        self._differences[self._count % KEPT] = np.tensordot(weights, [sample for _, sample in self._newest], 1)
         self._count += 1
         if self._count >= FEWEST and self._count % EVERY == 0:
-            # The midpoint and the half vector each have half the variance of an eye if the eyes' errors are independent.
             typical = np.median(np.abs(self._differences[: self._count]), axis=0).max(axis=0)
+            # If the eyes' errors are independent, an eye has twice the variance of the midpoint and of the vector.
             self.sigma_m = np.maximum(2**0.5 * MAD_TO_SIGMA * typical, LEAST_M)
 
 

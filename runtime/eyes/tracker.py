@@ -6,6 +6,7 @@ import math
 from bisect import bisect_left
 from collections import deque
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -36,75 +37,73 @@ CLOCK_RESET_NS = NS_PER_S  # if a capture time is this far in the past, the cloc
 COMPLETED_NOISE = 2.0  # factor for the standard deviation of a pair of eyes if one eye's position is inferred
 NOISE_FLOOR_M = 2e-5  # smallest standard deviation accepted from a driver; no sensor measures pupils more precisely
 ESTABLISHED = 3  # a head with fewer samples than this may be a mistake
-SIGMA_AHEAD_S = 1.0  # uncertainty is extrapolated no further than this
+SIGMA_AHEAD_S = imm.LONGEST_S  # uncertainty is extrapolated no further than this
 NEAREST_M = 0.1  # minimum distance from the display to use when weighing depth errors
 PANEL_M = (0.5184, 0.2916)  # default panel width and height
 NO_JUMP = np.zeros((2, 3))
+# The filtered quantities: the midpoint of the eyes and the vector from the midpoint to the right eye.
+MODELS = imm.Models.of(ACCELERATION, TURN_ACCELERATION, stay_s=STAY_S)
+HEAD_FROM_EYES = np.array([[0.5, 0.5], [-0.5, 0.5]])
+EYES_FROM_HEAD = np.array([[1.0, -1.0], [1.0, 1.0]])
 
 UNCERTAIN = "uncertain"
 ELSEWHERE = "not where the viewer is"
 
 
-class _Head(NamedTuple):
+@dataclass(frozen=True)
+class _Head:
     """One head's estimated motion at the time of its newest sample."""
 
     capture_ns: int  # capture time of the newest sample
-    middle: imm.Belief  # midpoint of the eyes, frame `stack`
-    half: imm.Belief  # vector from the midpoint to the right eye
+    belief: imm.Belief  # midpoint of the eyes, frame `stack`, and vector from the midpoint to the right eye
     samples: int  # number of samples behind the estimate
     surprise: float  # chi² of the newest sample
+
+    @cached_property
+    def moments(self) -> imm.Moments:
+        return imm.moments(self.belief, models=MODELS)
 
     def age_s(self, time_ns: int) -> float:
         return (time_ns - self.capture_ns) / NS_PER_S
 
     def eyes_m(self, ahead_s: float) -> F64:
         """Return the (2, 3) left and right eye `ahead_s` seconds after the newest sample."""
-        middle, half = imm.ahead(self.middle, ahead_s), imm.ahead(self.half, ahead_s)
-        return np.array([middle - half, middle + half])
+        eyes_m: F64 = EYES_FROM_HEAD @ imm.ahead(self.moments, ahead_s)
+        return eyes_m
 
 
 class _Sample(NamedTuple):
     """A measurement that has passed the plausibility checks."""
 
     capture_ns: int
-    middle_m: F64  # (3,) midpoint of the eyes, frame `stack`
-    half_m: F64  # (3,) vector from the midpoint to the right eye
-    noise_m2: F64  # (3, 3) covariance of `middle_m`, and also of `half_m`
+    head_m: F64  # (2, 3) midpoint of the eyes, frame `stack`, and vector from the midpoint to the right eye
+    noise_m2: F64  # (3, 3) covariance of each row of `head_m`
 
     def begun(self) -> _Head:
         """Return a new head estimated from this sample alone."""
-        middle = imm.started(self.middle_m, noise=self.noise_m2, speed=FIRST_SPEED, acceleration=ACCELERATION)
-        half = imm.started(self.half_m, noise=self.noise_m2, speed=FIRST_SPEED / 3, acceleration=TURN_ACCELERATION)
-        return _Head(self.capture_ns, middle, half, 1, 0.0)
+        belief = imm.started(self.head_m, noise=self.noise_m2, speeds=(FIRST_SPEED, FIRST_SPEED / 3), models=MODELS)
+        return _Head(self.capture_ns, belief, 1, 0.0)
 
     def continued(self, head: _Head) -> _Head | None:
         """Return a head updated with this sample, or None if the sample cannot belong to it."""
         age_s = head.age_s(self.capture_ns)
         if age_s > KEEP_S:
             return None
-        middle = imm.predicted(head.middle, age_s, acceleration=ACCELERATION, stay_s=STAY_S)
-        half = imm.predicted(head.half, age_s, acceleration=TURN_ACCELERATION, stay_s=STAY_S)
-        surprise = max(
-            imm.surprise(middle, self.middle_m, noise=self.noise_m2),
-            imm.surprise(half, self.half_m, noise=self.noise_m2),
-        )
+        expected = imm.predicted(head.belief, age_s, models=MODELS)
+        seen = imm.innovation(expected, self.head_m, noise=self.noise_m2, models=MODELS)
+        surprise = imm.surprise(seen, models=MODELS)
         if surprise > CHI2_GATE:
             return None
-        return _Head(
-            self.capture_ns,
-            imm.corrected(middle, self.middle_m, noise=self.noise_m2),
-            imm.corrected(half, self.half_m, noise=self.noise_m2),
-            head.samples + 1,
-            surprise,
-        )
+        belief = imm.corrected(expected, seen, models=MODELS)
+        return _Head(self.capture_ns, belief, head.samples + 1, surprise)
 
     def is_within_reach_of(self, head: _Head) -> bool:
         """Return True if a head could have moved to this sample's position since its own newest sample."""
         age_s = head.age_s(self.capture_ns)
         reach_m = min(REACH_SPEED * age_s, REACH_ACCELERATION * age_s**2 / 2)
-        noise_m = math.sqrt(np.trace(self.noise_m2 + head.middle.covariance[0, :3, :3]))
-        expected_m = imm.ahead(head.middle, min(age_s, HORIZON_S))
-        return bool(np.linalg.norm(self.middle_m - expected_m) <= reach_m + 4 * noise_m)
+        noise_m = math.sqrt(np.trace(self.noise_m2 + head.belief.covariance[0, :3, :3]))
+        off_m = self.head_m - imm.ahead(head.moments, min(age_s, HORIZON_S))
+        return bool(np.linalg.norm(off_m[0]) <= reach_m + 4 * noise_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,11 +193,10 @@ class Tracker:
             return UNCERTAIN
         if why := reason_against(points.eyes_m, in_front_m=self._in_front_m):
             return why
-        left, right = points.eyes_m
-        sample = _Sample(capture_ns, (left + right) / 2, (right - left) / 2, self._noise(points))
+        sample = _Sample(capture_ns, HEAD_FROM_EYES @ points.eyes_m, self._noise(points))
         refused = self._take(sample)
         if not refused:
-            self._measured.add(sample.middle_m, sample.half_m, capture_ns=capture_ns)
+            self._measured.add(sample.head_m, capture_ns=capture_ns)
         return refused
 
     def forget(self) -> None:
@@ -212,11 +210,15 @@ class Tracker:
 
         If the driver reports a covariance, it is raised to a minimum. Otherwise, the noise in the settings is used.
         """
-        sigma_m = self._measured.sigma_m if self._measured.sigma_m is not None else np.full(3, self.settings.noise_m)
-        noise: F64 = np.diag(sigma_m**2 / 2)
         if points.covariance_m2 is not None and np.isfinite(points.covariance_m2).all():
-            variances, axes = np.linalg.eigh((points.covariance_m2 + points.covariance_m2.T) / 2)
-            noise = (axes * np.maximum(variances, NOISE_FLOOR_M**2)) @ axes.T
+            noise: F64 = (points.covariance_m2 + points.covariance_m2.T) / 2
+            if not _exceeds(noise, NOISE_FLOOR_M**2):
+                variances, axes = np.linalg.eigh(noise)
+                noise = (axes * np.maximum(variances, NOISE_FLOOR_M**2)) @ axes.T
+        elif self._measured.sigma_m is not None:
+            noise = np.diag(self._measured.sigma_m**2 / 2)
+        else:
+            noise = self.settings.noise_m**2 / 2 * np.eye(3)
         return noise * COMPLETED_NOISE**2 if points.completed else noise
 
     def _take(self, sample: _Sample) -> str:
@@ -226,11 +228,15 @@ class Tracker:
         last = self._history[-1]
         age_s = last.head.age_s(sample.capture_ns)
         is_held = self._lost_ns is not None or age_s > HORIZON_S
+        head = sample.continued(last.head)
+        if head is not None and head.surprise <= CHI2_DOUBT:
+            self._follow(head, is_return=is_held)
+            return ""
         known = self._other
         again = sample.continued(known.head) if known is not None else None
-        if head := sample.continued(last.head):
+        if head is not None:
             is_others = again is not None and again.surprise < head.surprise and not (known and known.may_be_viewer)
-            if head.surprise <= CHI2_DOUBT or not is_others:
+            if not is_others:
                 self._follow(head, is_return=is_held)
                 return ""
         if known is not None and again is not None:
@@ -328,13 +334,23 @@ class Tracker:
     def _estimate(self, time_ns: int, head: _Head, eyes_m: F64, label: EyesLabel) -> EyesEstimate:
         """Return the estimate for `eyes_m`, with a standard deviation that has grown since the sample."""
         age_s = min(max(head.age_s(time_ns), 0.0), SIGMA_AHEAD_S)
-        middle_m, half_m = (eyes_m[0] + eyes_m[1]) / 2, (eyes_m[1] - eyes_m[0]) / 2
-        if label in ("exact", "interpolated"):
-            middle_m, half_m = imm.ahead(head.middle, 0.0), imm.ahead(head.half, 0.0)
-        error_m2 = imm.spread(head.middle, age_s, acceleration=ACCELERATION, about=middle_m)
-        error_m2 += imm.spread(head.half, age_s, acceleration=TURN_ACCELERATION, about=half_m)
-        sigma_m = sideways_sigma_m(error_m2, middle_m, panel_m=self._panel_m)
+        is_past = label in ("exact", "interpolated")
+        head_m: F64 = head.moments.mean[:, 0] if is_past else HEAD_FROM_EYES @ eyes_m
+        off_m = imm.ahead(head.moments, age_s) - head_m
+        error_m2 = imm.spread(head.moments, age_s) + off_m.T @ off_m  # an eye is the midpoint plus or minus the vector
+        sigma_m = sideways_sigma_m(error_m2, head_m[0], panel_m=self._panel_m)
         return EyesEstimate(time_ns, head.capture_ns, eyes_m, label, sigma_m)
+
+
+def _exceeds(covariance: F64, variance: float) -> bool:
+    """Return True if a (3, 3) covariance has a larger variance than the given one in every direction.
+
+    By Sylvester's criterion, it has if the leading minors of the difference are positive.
+    """
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = covariance.tolist()
+    xx, yy, zz = xx - variance, yy - variance, zz - variance
+    minor = xx * yy - xy * xy
+    return bool(xx > 0 and minor > 0 and zz * minor + 2 * xy * xz * yz - xx * yz * yz - yy * xz * xz > 0)
 
 
 def sideways_sigma_m(error_m2: F64, eye_m: F64, *, panel_m: tuple[float, float]) -> float:
@@ -349,7 +365,9 @@ def sideways_sigma_m(error_m2: F64, eye_m: F64, *, panel_m: tuple[float, float])
         eye_m: (3,) position of the eyes' midpoint in frame `stack`.
         panel_m: Panel width and height.
     """
-    x, y, z = max(float(eye_m[0]), NEAREST_M), float(eye_m[1]), float(eye_m[2])
+    x, y, z = eye_m.tolist()
+    x = max(x, NEAREST_M)
+    (xx, xy, xz), (_, yy, _), (_, _, zz) = error_m2.tolist()
     lever2 = (y * y + z * z + (panel_m[0] ** 2 + panel_m[1] ** 2) / 12) / (x * x)
-    both = error_m2[1, 1] + error_m2[2, 2] - 2 * (y * error_m2[0, 1] + z * error_m2[0, 2]) / x
-    return math.sqrt(max(float(both + lever2 * error_m2[0, 0]), 0.0) / 2)
+    both = yy + zz - 2 * (y * xy + z * xz) / x
+    return math.sqrt(max(both + lever2 * xx, 0.0) / 2)

@@ -115,7 +115,9 @@ class CostBook:
         the two raster widths. Without this limit, a raster might never be chosen again if other work had slowed down
         its initial measurement.
         """
-        both = [(ms, self.first[by][s]) for by, of in self._measured.items() for s, ms in of.items() if s in self.first[by]]
+        both = [
+            (ms, self.first[by][s]) for by, of in self._measured.items() for s, ms in of.items() if s in self.first[by]
+        ]
         measured_ms, first_ms = sum(ms for ms, _ in both), sum(ms for _, ms in both)
         scale = measured_ms / first_ms if first_ms > 0 and measured_ms > 0 else 1.0
         latest = min(self._measured, key=self._unused.__getitem__, default=None)

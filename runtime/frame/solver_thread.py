@@ -259,7 +259,9 @@ class SolverThread(SolverHost):
         if self._publish(attempt, step) and step.solution is not None:
             assert attempt.costs is not None and step.solution.effort is not None
             stages = step.solution.stage_ms
-            rest_ms = max(attempt.took_ns[-1] / NS_PER_MS - sum(stages.get(stage, 0.0) for stage in SOLVING_STAGES), 0.0)
+            rest_ms = max(
+                attempt.took_ns[-1] / NS_PER_MS - sum(stages.get(stage, 0.0) for stage in SOLVING_STAGES), 0.0
+            )
             attempt.costs.learn(step.solution.effort, {**stages, REST: rest_ms})
             self._costs = attempt.costs.costs()
 
