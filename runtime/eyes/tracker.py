@@ -21,6 +21,7 @@ from runtime.records import F64, EyePoints, EyesEstimate, EyesLabel
 HISTORY = 256  # number of filtered samples kept: four seconds at 60 Hz
 CONFIDENCE_MIN = 0.3  # samples with less confidence, such as those taken during a blink, are refused
 CHI2_GATE = 21.1  # limit for chi² with three degrees of freedom; refuses one good sample in 10,000
+SLACK_M2 = 0.002**2 * np.eye(3)  # added to the gate's noise, because heads also move in ways that no model expects
 CHI2_DOUBT = 11.3  # 1 % limit; a sample beyond it is undone if the next two fit better without it
 ACCELERATION = (0.05, 0.4, 2.0)  # standard deviations in m/s² for a calm, a moving and a fast head
 STAY_S = 1.0  # mean time that a head stays calm, moving or fast
@@ -31,7 +32,8 @@ REACH_SPEED, REACH_ACCELERATION = 2.0, 30.0  # limits of a head's motion in m/s 
 KEEP_S = 0.4  # after a longer gap between samples, a head's motion estimate is discarded
 ANOTHER_AFTER_S = 0.5  # a viewer unseen for this long, or for hold_s if that is shorter, is replaced by another person
 HORIZON_S = 0.2  # longest prediction; after this time without a sample, eyes are held
-DECAY_S = 0.06  # time constant for slowing a lost head's predicted motion to rest
+COAST_S = 0.4  # a lost head moves on for at most this long after its newest sample
+DECAY_S = 0.2  # time constant for slowing a lost head to rest; most heads move on while the sensor misses them
 REVIVE_S = 0.06  # length of the blend when lost eyes are found again
 CLOCK_RESET_NS = NS_PER_S  # if a capture time is this far in the past, the clock was set back
 COMPLETED_NOISE = 2.0  # factor for the standard deviation of a pair of eyes if one eye's position is inferred
@@ -93,7 +95,9 @@ class _Sample(NamedTuple):
         seen = imm.innovation(expected, self.head_m, noise=self.noise_m2, models=MODELS)
         surprise = imm.surprise(seen, models=MODELS)
         if surprise > CHI2_GATE:
-            return None
+            loosely = imm.innovation(expected, self.head_m, noise=self.noise_m2 + SLACK_M2, models=MODELS)
+            if imm.surprise(loosely, models=MODELS) > CHI2_GATE:
+                return None
         belief = imm.corrected(expected, seen, models=MODELS)
         return _Head(self.capture_ns, belief, head.samples + 1, surprise)
 
@@ -101,7 +105,7 @@ class _Sample(NamedTuple):
         """Return True if a head could have moved to this sample's position since its own newest sample."""
         age_s = head.age_s(self.capture_ns)
         reach_m = min(REACH_SPEED * age_s, REACH_ACCELERATION * age_s**2 / 2)
-        noise_m = math.sqrt(np.trace(self.noise_m2 + head.belief.covariance[0, :3, :3]))
+        noise_m = math.sqrt(np.trace(self.noise_m2 + SLACK_M2 + head.belief.covariance[0, :3, :3]))
         off_m = self.head_m - imm.ahead(head.moments, min(age_s, HORIZON_S))
         return bool(np.linalg.norm(off_m[0]) <= reach_m + 4 * noise_m)
 
@@ -315,6 +319,7 @@ class Tracker:
         label: EyesLabel = "held" if self._lost_ns is not None or age_s > HORIZON_S else "predicted"
         ahead_s = min(age_s, HORIZON_S)
         if self._lost_ns is not None:
+            ahead_s = min(age_s, COAST_S)
             known_s = min(newest.head.age_s(self._lost_ns), ahead_s)
             ahead_s = known_s + DECAY_S * -math.expm1(-(ahead_s - known_s) / DECAY_S)
         eyes_m = newest.eyes_m(ahead_s, time_ns)

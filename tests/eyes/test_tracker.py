@@ -76,7 +76,12 @@ def test_a_lost_face_is_held_coming_to_rest_then_nobody() -> None:
     assert {a.label for a in path} == {"held"}
     y = np.array([a.eyes_m[0, 1] for a in path])
     steps = np.diff(y)
-    assert (steps >= -1e-12).all() and steps[0] > 3 * steps[7] and steps[-1] < 1e-6
+    assert (
+        (steps >= -1e-12).all()
+        and (np.diff(steps[5:]) <= 1e-12).all()
+        and steps[0] > 3 * steps[25]
+        and steps[-1] < 1e-6
+    )
     assert tracker.at(last + (HOLD_MS + 1) * MS).label == "none"
 
 
@@ -216,7 +221,7 @@ def test_eyes_that_return_are_followed_within_two_samples_and_without_a_jump(los
             tracker.update(points(elsewhere), capture_ns=back_ns + k * PERIOD)
         shown.append((ns, tracker.at(ns + ahead)))
     y = np.array([a.eyes_m[0, 1] for _, a in shown])
-    assert np.abs(np.diff(y)).max() < 0.045  # of 80 mm: no frame shows more than about half of the way
+    assert np.abs(np.diff(y)).max() < 0.05  # of 80 mm: no frame shows much more than half of the way
     arrived = next(ns for ns, a in shown if abs(a.eyes_m[0, 1] - elsewhere[0, 1]) < 0.015)
     assert arrived - back_ns <= 2 * PERIOD + PERIOD // 3
 
@@ -250,7 +255,7 @@ def test_a_turning_and_tilting_head_is_followed_without_refusing_samples() -> No
 
 def test_an_eye_that_was_filled_in_pulls_less() -> None:
     def pull(completed: str) -> np.float64:
-        tracker, last = fed()
+        tracker, last = fed(10)  # too few samples to measure the noise
         tracker.update(points(STILL + np.array([0.004, 0, 0]), completed=completed), capture_ns=last + PERIOD)
         return tracker.at(last + PERIOD).eyes_m[0, 0] - 0.6
 

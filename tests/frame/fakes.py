@@ -94,6 +94,9 @@ class FakeSolver(SolverHost):
     def hand_over(self, *, solved: Solution | None = None, flat: Solution | None = None, **missing: str) -> None:
         self.there = SolverUpdate(solved or self.there.solution, flat or self.there.flat, missing)
 
+    def free_ns(self, now_ns: int) -> int:
+        return now_ns
+
     def post(self, request: SolveRequest) -> None:
         self.requests.append(request)
 
