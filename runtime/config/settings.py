@@ -142,7 +142,8 @@ class TrackerSettings(Section):
     )
     noise_m: Annotated[float, within(1e-6, 0.2, "m")] = Field(
         0.003,
-        description="standard deviation of measured eye positions on each axis, for sensors that do not report it",
+        description="standard deviation of measured eye positions on each axis, until it has been measured, for "
+        "sensors that do not report it",
     )
 
 

@@ -173,7 +173,7 @@ class DrawnPart:
         return self.vertices[:, :3]
 
     def front_faces(self, look: _Look) -> str | None:
-        """Return the winding (`cw` or `ccw`) of the visible faces in a picture, or None if both may be visible."""
+        """Return the winding of the visible faces in a picture (`cw` or `ccw`), or None if both may be."""
         if not self._solid_winding or look.eye is None:
             return None
         if not ((look.eye < self._low_m) | (look.eye > self._high_m)).any():  # from within, the inside is visible
