@@ -68,9 +68,9 @@ def welded(positions_m: F32) -> NDArray[np.int64]:
 def solid_winding(shape: Shape) -> int:
     """Return the winding of a solid shape's triangles, or 0 if the shape is not solid.
 
-    The triangles of a solid shape enclose volumes and have the same winding everywhere, as seen from outside: 1 if it is
-    counter-clockwise, -1 if it is clockwise. From outside, the back faces of such a shape are always hidden. Vertices at
-    the same position are treated as one, and connected triangles as one body.
+    The triangles of a solid shape enclose volumes and have the same winding everywhere, as seen from outside: 1 if it
+    is counter-clockwise, -1 if it is clockwise. From outside, the back faces of such a shape are always hidden.
+    Vertices at the same position are treated as one, and connected triangles as one body.
     """
     corners = welded(shape.positions_m)[shape.triangles]
     real = (np.diff(np.sort(corners, axis=1), axis=1) > 0).all(1)  # a sphere has zero-area triangles at its poles
