@@ -13,6 +13,7 @@ from runtime.frame.effort import (
     BLUR_M,
     FIRST_DETAIL,
     KEPT_SOLUTIONS,
+    REST,
     CostBook,
     Costs,
     EffortChooser,
@@ -130,6 +131,13 @@ def test_measured_costs_replace_first_ones_and_scale_those_of_other_rasters() ->
     costs = book.costs()
     assert costs.ms(Effort(2, 0)) == pytest.approx(153.0 / 12)
     assert costs.ms(Effort(1, 0)) == pytest.approx(153.0 / 3)
+
+
+def test_time_that_belongs_to_no_stage_counts_for_every_raster() -> None:
+    book = CostBook({by: {"render": 100.0 / by**2} for by in REDUCTIONS})
+    book.learn(Effort(2, 0), {"render": 25.0, REST: 5.0})
+    assert book.costs().ms(Effort(2, 0)) == pytest.approx(30.0)
+    assert book.costs().ms(Effort(4, 0)) == pytest.approx(100.0 / 16 + 5.0)
 
 
 def test_a_first_time_that_other_work_delayed_does_not_exclude_a_raster() -> None:

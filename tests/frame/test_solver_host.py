@@ -62,6 +62,15 @@ def test_a_solution_is_handed_over_exactly_when_its_cost_has_passed(
     assert made.stage_ms == {"render": 8.0, "prepare": 4.0, "inference": 3.0, "finish": 8.0, "step": 0.0}
 
 
+def test_a_busy_solver_says_when_it_will_begin_another_request(host: SimulatedSolver, clock: SimulatedClock) -> None:
+    now_ns = clock.now_ns()
+    assert host.free_ns(now_ns) == now_ns
+    host.post(wish(1))
+    assert host.free_ns(now_ns) == now_ns + SUM_NS
+    clock.advance_ns(SUM_NS)
+    assert host.free_ns(clock.now_ns()) == clock.now_ns()
+
+
 def test_a_busy_solver_takes_the_newest_request_next(
     host: SimulatedSolver, parts: FakeParts, clock: SimulatedClock
 ) -> None:
