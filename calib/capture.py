@@ -21,7 +21,7 @@ from calib.viewpoints import Viewpoint, grid
 from runtime.clock import NS_PER_S, SimulatedClock
 from runtime.config import Settings
 from runtime.errors import InputError
-from runtime.eyes.rest import MAD_TO_SIGMA
+from runtime.eyes.noise import MAD_TO_SIGMA
 from runtime.eyes.tracker import CONFIDENCE_MIN
 from runtime.records import F64, EyePoints
 from runtime.sensor.registry import open_sensor

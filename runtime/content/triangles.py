@@ -157,8 +157,9 @@ class DrawnPart:
                 self.vertices[:, first : first + values.shape[1]] = values
         outlined = outlined and not self.is_blended and len(mesh.triangles) <= OUTLINED_MAX
         self.edges = edges_of(mesh) if outlined else None
-        opaque = not {"BLEND", "HOLES"} & set(self.features)
-        self._solid_winding = solid_winding(mesh) if opaque and len(mesh.triangles) <= OUTLINED_MAX else 0
+        # A part with a border is not solid, and the full check takes as long as finding the edges.
+        may_be_solid = self.edges is not None and not self.edges.border.any() and "HOLES" not in self.features
+        self._solid_winding = solid_winding(mesh) if may_be_solid else 0
         low, high = mesh.positions_m.min(0), mesh.positions_m.max(0)
         if part.turning:
             reach = float(np.linalg.norm(mesh.positions_m, axis=1).max())

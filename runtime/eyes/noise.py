@@ -15,7 +15,7 @@ from runtime.clock import NS_PER_S
 from runtime.records import F64
 
 WINDOW = 5  # samples to a difference
-LONGEST_NS = NS_PER_S * 2 // 5  # samples farther apart than this are no window, because a head may turn in between
+LONGEST_NS = NS_PER_S * 2 // 5  # longest window, because a head may turn within a longer one
 KEPT = 64  # number of newest differences kept: two seconds at 30 Hz
 FEWEST = 16  # number of differences needed for a measurement
 EVERY = 4  # noise changes slowly, so it is measured once in this many samples
@@ -26,14 +26,14 @@ LEAST_M = 1e-4  # smallest standard deviation returned, because a head does not 
 class NoiseWatch:
     """Measures the noise of the eye positions that a tracker accepts.
 
-    Not thread-safe. The time is taken from the samples; no clock is read.
+    Not thread-safe. Never reads a clock.
     """
 
     def __init__(self) -> None:
         self.sigma_m: F64 | None = None  # (3,) standard deviation of one eye along x, y and z; None: not yet known
         self._newest: deque[tuple[int, F64]] = deque(maxlen=WINDOW)  # capture times and samples
         self._differences = np.zeros((KEPT, 2, 3))
-        self._count = 0  # differences so far
+        self._count = 0  # number of differences computed
 
     def add(self, head_m: F64, *, capture_ns: int) -> None:
         """Add an accepted sample and update `sigma_m`.

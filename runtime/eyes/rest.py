@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from runtime.clock import NS_PER_S
+from runtime.eyes.noise import MAD_TO_SIGMA
 from runtime.records import F64
 
 REST_NS = NS_PER_S  # a head counts as at rest if it has not moved for this long
@@ -25,7 +26,6 @@ NOISE_MAX_M = 0.005  # with more noise than this, no head counts as at rest, bec
 SINGLE = 4.5  # for two consecutive samples that deviate in the same direction
 MEDIAN_OF_FIVE = 2.6  # for the median of the newest five samples
 HALVES = 4.5  # for the difference between the two halves of the samples, in its own standard deviations
-MAD_TO_SIGMA = 1.4826  # a normal distribution's standard deviation, divided by its median absolute deviation
 MEDIAN_EFFICIENCY = 1.25  # a median's standard deviation, divided by a mean's
 LEVER_M = 0.15  # RMS distance from the centre to the points on a display half a metre wide
 NEAREST_M = 0.1  # smaller distances from the display are raised to this

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from runtime.clock import NS_PER_MS, NS_PER_S
-from runtime.frame.effort import HORIZON_S, Costs, EffortChooser, Outlook, candidates, spread_s
+from runtime.frame.effort import HORIZON_S, Costs, EffortChooser, Outlook, candidates, display_spread_s
 from runtime.frame.run_state import RunState
 from runtime.frame.solver_host import SolverHost
 from runtime.frame.viewer import Viewer
@@ -119,7 +119,7 @@ class Aim:
                 most = predictor.refined_steps
                 refined = self._refined(shown, most, costs, shown_error=error, horizon_s=horizon_s)
             cost_ms = costs.ms(effort)
-            expected_m2 = outlook(cost_ms).moved_m2(spread_s(cost_ms, period_ms=period_ms))
+            expected_m2 = outlook(cost_ms).moved_m2(display_spread_s(cost_ms, period_ms=period_ms))
         cost_ns = round(costs.ms(effort) * NS_PER_MS)
         then_ns, then_m, label = self._eyes_then(slots, eyes, cost_ns=cost_ns)
         self._expected[then_ns] = expected_m2

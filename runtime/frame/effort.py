@@ -146,12 +146,12 @@ class Outlook:
         """Return the mean squared distance from a solution's eyes to the true eyes, in m².
 
         Args:
-            spread_s: RMS deviation of the solution's display times from their middle, in seconds (`spread_s`).
+            spread_s: RMS deviation of the solution's display times from their middle, in seconds (`display_spread_s`).
         """
         return 2 * self.sigma_m**2 + (self.speed_m_s * spread_s) ** 2 + self.lag_m**2
 
 
-def spread_s(cost_ms: float, *, period_ms: float) -> float:
+def display_spread_s(cost_ms: float, *, period_ms: float) -> float:
     """Return the RMS deviation, from their middle, of the display times of a solution, in seconds.
 
     The display times of n refreshes deviate by the period times sqrt((n² - 1)/12). A solution is shown at one refresh
@@ -272,7 +272,9 @@ class EffortChooser:
         means: dict[Effort, float] = {}
         for effort in efforts:
             cost_ms = costs.ms(effort)
-            error = self.expected_error(effort, outlook(cost_ms), spread_s=spread_s(cost_ms, period_ms=period_ms))
+            error = self.expected_error(
+                effort, outlook(cost_ms), spread_s=display_spread_s(cost_ms, period_ms=period_ms)
+            )
             means[effort] = self.mean_error(error, cost_ms, shown_error=shown_error, horizon_s=horizon_s)
         least = min(means.values())
         best = min((effort for effort in means if means[effort] <= EQUAL * least), key=costs.ms)
