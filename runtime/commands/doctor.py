@@ -185,17 +185,16 @@ def usb(settings: Settings) -> Iterator[Row]:
 
 def opengl(settings: Settings) -> Iterator[Row]:
     """Check that OpenGL works without a screen, as needed for content and offscreen panels."""
-    from runtime.support.gl import describe, offscreen_context
+    from runtime.support.gl import describe, draws_in_software, offscreen_context
 
     context = offscreen_context()
     try:
-        found = describe(context)
+        found, software = describe(context), draws_in_software(context)
     finally:
         context.release()
     for node in sorted(Path("/dev/dri").glob("renderD*")):
         if not os.access(node, os.R_OK | os.W_OK):
             yield Row("opengl", "warn", f"this user cannot open {node}", "add the user to the groups video and render")
-    software = any(name in found["renderer"].lower() for name in ("llvmpipe", "softpipe", "swrast"))
     bad = software and (settings.output.kind != "offscreen" or settings.model.backend == "gl")
     slow = "software rendering is slow; if this machine has a GPU, install its driver" if software else ""
     yield Row("opengl", "warn" if bad else "ok", f"{found['renderer']}, {found['version']} ({found['vendor']})", slow)

@@ -322,8 +322,9 @@ class Presenter:
 
     def _presented_at(self, timing: FrameTiming, report: PresentReport | None, *, woke_ns: int) -> int:
         """Tell the pacer what happened to a refresh, and return its display time."""
-        blank_ns = report.vblank_ns if report is not None else None
-        return self.pacer.presented(timing, woke_ns=woke_ns, done_ns=self.clock.now_ns(), blank_ns=blank_ns)
+        if report is None:
+            return self.pacer.presented(timing, woke_ns=woke_ns, done_ns=self.clock.now_ns())
+        return self.pacer.presented(timing, woke_ns=woke_ns, done_ns=report.present_ns, blank_ns=report.vblank_ns)
 
     def _missing(self, news: SolverUpdate, lost: str) -> dict[str, str]:
         missing = dict(news.missing)

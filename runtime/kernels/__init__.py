@@ -22,6 +22,8 @@ SUBCODE = 16  # fixed-point units per 8-bit panel code
 FULL = 255 * SUBCODE  # range of a panel value, which rotates the polarization by up to a quarter turn
 EDGE_PX = 4  # maximum distance, in pixels, that an image may be sampled beyond its edge
 EDGE_CLAMP_PX = 2  # distance, in pixels, that the values of a picture's border rays are repeated beyond it
+CURVE_STEPS = 16  # entries per code of a panel's grey curve
+CURVE_ENTRIES = 256 * CURVE_STEPS
 TABLE_STEPS = 16  # table entries per code value, for the intensities of bilinearly sampled rays
 _AGAIN = "reinstall phasestack (this requires g++)"
 _pointer, _int, _long, _float, _double = (
@@ -90,9 +92,28 @@ class ErrorSum(ctypes.Structure):
     _fields_ = (("total", _double), ("counted", _long))
 
 
+class ScaleShift(ctypes.Structure):
+    """Map from the screen's pixels to positions in a picture, along both axes."""
+
+    _fields_ = (("scale_u", _float), ("scale_v", _float), ("shift_u", _float), ("shift_v", _float))
+
+
+class ShownPanel(ctypes.Structure):
+    """One panel's picture to draw: where it is sampled, what is mixed in and where it goes. `Shown` in C++."""
+
+    _fields_ = (
+        ("source", _pointer), ("source_stride", _long), ("screen", _pointer), ("screen_stride", _long),
+        ("flat", _pointer), ("flat_stride", _long), ("curve", _pointer), ("relief", _pointer),
+        ("source_rows", _int), ("source_columns", _int), ("rows", _int), ("columns", _int),
+        ("relief_rows", _int), ("relief_columns", _int),
+        ("source_from_screen", ScaleShift), ("relief_from_screen", ScaleShift), ("push", ScaleShift),
+        ("flatness", _float),
+    )  # fmt: skip
+
+
 COMPILED = {
     "problem_bytes": ctypes.sizeof(Problem), "warp_bytes": ctypes.sizeof(Warp), "view_bytes": ctypes.sizeof(KernelView),
-    "max_sets": MAX_SETS,
+    "shown_bytes": ctypes.sizeof(ShownPanel), "max_sets": MAX_SETS,
 }  # fmt: skip
 
 
@@ -110,6 +131,7 @@ def library() -> Any:
         "show": (_pointer, _int, _pointer, _long, _int, _int),
         "warp": (_pointer, _pointer, _pointer, _int, _int, _int, _int),
         "squared_error": (_pointer, _int, _int, _pointer),
+        "draw_panels": (_pointer, _int, _int),
     }.items():
         function = getattr(loops, name, None)
         if function is None:

@@ -67,8 +67,15 @@ class Window:
     """A GLFW window and its moderngl context."""
 
     handle: Any
-    context: moderngl.Context
+    context: moderngl.Context | None  # None if OpenGL does not draw in this window
     faults: list[str] = field(default_factory=list)  # faults reported by callbacks
+    exposed: bool = False  # True if the X server has lost a part of the window's picture
+
+    @property
+    def gl(self) -> moderngl.Context:
+        """The window's context, in windows that have one."""
+        assert self.context is not None
+        return self.context
 
     def make_current(self) -> None:
         """Make the window's context current on this thread."""
@@ -101,7 +108,7 @@ def _connect() -> None:
     if glfw.get_platform() != glfw.PLATFORM_X11:
         raise MissingPart("GLFW is not using X11, which is required to place windows on monitors; start an X server")
     xlib.take_over_errors()
-    watch = xlib.ServerWatch(_pointer())
+    watch = xlib.ServerWatch(x_display())
 
 
 class Display:
@@ -146,19 +153,26 @@ class Display:
         """Return the active monitors, sorted from left to right."""
         return in_order([monitor for monitor, _ in self._pairs()])
 
-    def fullscreen_window(self, monitor: Monitor, *, title: str) -> Window:
-        """Open a borderless window that fills a monitor, and make its context current.
+    def fullscreen_window(self, monitor: Monitor, *, title: str, opengl: bool = True) -> Window:
+        """Open a borderless window that fills a monitor, and make its context current, if it has one.
+
+        Args:
+            monitor: The monitor.
+            title: The window's title.
+            opengl: True to create a context that shares objects with the root window's.
 
         Raises:
             PanelLost: The monitor is no longer connected, or the X server does not support OpenGL.
         """
-        share = self.root.handle
+        share = self.root.handle if opengl else None
         handles = {connected.connector: handle for connected, handle in self._pairs()}
         if monitor.connector not in handles:
             raise PanelLost(f"{monitor.connector} is no longer connected")
-        glfw.window_hint(glfw.VISIBLE, True)
+        _hints()
+        if not opengl:
+            glfw.window_hint(glfw.CLIENT_API, glfw.NO_API)
         handle = glfw.create_window(monitor.width_px, monitor.height_px, title, handles[monitor.connector], share)
-        return self._adopt(handle)
+        return self._adopt(handle, opengl=opengl)
 
     def poll(self) -> str:
         """Process X events, and return a description of any fault that makes the windows unusable, or ""."""
@@ -181,19 +195,24 @@ class Display:
 
     def _close_from(self, first: int) -> None:
         for window in self._windows[first:]:
-            window.context.release()
+            if window.context is not None:
+                window.context.release()
             glfw.destroy_window(window.handle)
         self._windows = self._windows[:first]
 
-    def _adopt(self, handle: Any) -> Window:
-        glfw.make_context_current(handle)
-        context = _attach(handle)
-        window = Window(handle, context)
+    def _adopt(self, handle: Any, *, opengl: bool = True) -> Window:
+        if opengl:
+            glfw.make_context_current(handle)
+        window = Window(handle, _attach(handle) if opengl else None)
 
         def closed(_handle: Any) -> None:
             window.faults.append("a panel's window was closed")
 
+        def exposed(_handle: Any) -> None:
+            window.exposed = True
+
         glfw.set_window_close_callback(handle, closed)
+        glfw.set_window_refresh_callback(handle, exposed)
         glfw.set_input_mode(handle, glfw.CURSOR, glfw.CURSOR_HIDDEN)
         self._windows.append(window)
         return window
@@ -205,7 +224,7 @@ class Display:
             connector: The output's name, such as `DP-1`.
         """
         output = self._outputs.get(connector)
-        return xlib.output_state(_pointer(), output) if output else None
+        return xlib.output_state(x_display(), output) if output else None
 
     def window_state(self, window: Window) -> tuple[bool, Rectangle] | None:
         """Return a window's state, or None if another program has destroyed it.
@@ -252,6 +271,12 @@ class Display:
         return len(self._windows) > 1
 
 
+def x_display() -> int:
+    """Return a pointer to GLFW's connection to the X server, an Xlib `Display`."""
+    pointer = glfw.get_x11_display()
+    return int(getattr(pointer, "value", pointer) or 0)
+
+
 def connected_monitors() -> tuple[Monitor, ...]:
     """Return the active monitors, sorted from left to right.
 
@@ -285,11 +310,6 @@ def _hints() -> None:
     glfw.window_hint(glfw.AUTO_ICONIFY, False)
     glfw.window_hint(glfw.FOCUS_ON_SHOW, False)
     glfw.window_hint(glfw.RESIZABLE, False)
-
-
-def _pointer() -> int:
-    pointer = glfw.get_x11_display()
-    return int(getattr(pointer, "value", pointer) or 0)
 
 
 def _text(error: Exception) -> str:

@@ -47,6 +47,11 @@ class Monitor:
         return Rectangle(self.x_px, self.y_px, self.width_px, self.height_px)
 
     @property
+    def size_px(self) -> tuple[int, int]:
+        """Width and height."""
+        return self.width_px, self.height_px
+
+    @property
     def setting(self) -> str:
         """Configuration line that selects this monitor in `[[output.panels]]`."""
         return f'edid_serial = "{self.serial}"' if self.serial else f'connector = "{self.connector}"'

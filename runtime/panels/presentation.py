@@ -276,6 +276,7 @@ class Painter:
             InputError: The grey curve's file cannot be read or is invalid.
             ValueError: The homography is singular or not finite.
         """
+        self.screen_px = screen_px
         matrix = layer_from_screen(
             screen_width_px=screen_px[0],
             screen_height_px=screen_px[1],

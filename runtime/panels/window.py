@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import logging
 from typing import Any
 
@@ -14,9 +13,9 @@ from runtime.errors import PanelLost
 from runtime.optics.stack import PanelStack
 from runtime.panels.base import PanelSink
 from runtime.panels.card import identity_card
-from runtime.panels.display import Display, Window, connected_monitors, gl_function, glfw
+from runtime.panels.display import Display, connected_monitors, glfw
+from runtime.panels.drawing import ContextLost, PanelWindows, open_windows
 from runtime.panels.monitors import Monitor, bind, check_modes, refresh_difference
-from runtime.panels.presentation import FrameTextures, Painter
 from runtime.panels.watch import PlacementWatch
 from runtime.records import U8, PanelFrame, PresentReport
 from runtime.support.gl import offscreen_context
@@ -30,11 +29,11 @@ LOOK_NS = 5 * NS_PER_S  # interval between searches for monitors if X sends no n
 class WindowPanels(PanelSink):
     """Output to X11 monitors, using one fullscreen window for each panel.
 
-    `present` uploads a new solution once, to textures shared by all windows. It draws all windows, waits for the GPU,
-    and then swaps all windows' buffers one right after another. If anything fails before the first swap, the old frame
-    stays on all panels. Only the first window waits for its vertical blank, because with N windows waiting, the refresh
-    rate would be divided by N. `skew_ms` is the time from when the first swap returns until the last one returns. It
-    does not include phase differences between the monitors' vertical blanks.
+    `present` uploads a new solution once, draws it for all windows and then shows all windows one right after another.
+    If anything fails before the first is shown, the old frame stays on all panels. With OpenGL, only the first window
+    waits for its vertical blank, because with N windows waiting, the refresh rate would be divided by N. `skew_ms` is
+    the time from when the first panel is shown until the last one is. It does not include phase differences between the
+    monitors' vertical blanks.
 
     Once per second, each window and monitor is compared with its initial state. A refresh makes at most one query,
     which takes about 0.1 ms. If a monitor, window or context has changed or is lost, all windows are closed and
@@ -50,7 +49,7 @@ class WindowPanels(PanelSink):
 
     def __init__(
         self, panels: tuple[PanelSettings, ...], stack: PanelStack, clock: Clock, content: moderngl.Context, *,
-        any_shape: bool = False,
+        any_shape: bool = False, on_processor: bool | None = None,
     ) -> None:  # fmt: skip
         """Open a window for each panel.
 
@@ -61,18 +60,19 @@ class WindowPanels(PanelSink):
             content: The content's GL context.
             any_shape: True to accept monitors whose resolution differs from the stack's and to fill them, for
                 `identify`.
+            on_processor: True to draw on the processor if that is possible, False to draw by OpenGL, or None to draw on
+                the processor if there is no GPU.
 
         Raises:
             InputError: No monitor is named for a panel, or its settings are invalid.
             PanelLost: The X server or a monitor is missing or cannot be used. This may be temporary.
             MissingPart: GLFW does not use X11.
         """
-        self._any_shape = any_shape
+        self._any_shape, self._on_processor = any_shape, on_processor
         self._panels, self._stack = panels, stack
         self._clock, self._content = clock, content
         self._display: Display | None = None
-        self._surfaces: list[tuple[Window, Painter]] = []  # one per panel
-        self._textures: FrameTextures | None = None
+        self._windows: PanelWindows | None = None
         self._watch: PlacementWatch | None = None
         self._retry_ns, self._lost = 0, ""
         self._shown = False  # True while the previous frame is on the windows
@@ -98,7 +98,7 @@ class WindowPanels(PanelSink):
 
     @property
     def window_handles(self) -> list[Any]:
-        return [window.handle for window, _ in self._surfaces]
+        return [window.handle for window in self._windows.windows] if self._windows is not None else []
 
     def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
         """Show a frame on all panels, unless it is unchanged and still on them.
@@ -106,16 +106,16 @@ class WindowPanels(PanelSink):
         Raises:
             PanelLost: A window, monitor or context has changed or is lost.
         """
-        if not self._surfaces and not self._may_try():
+        if self._windows is None and not self._may_try():
             raise PanelLost(self._lost)
         try:
-            if not self._surfaces:
+            if self._windows is None:
                 self._open()
                 log.info("panels are working again: %s", ", ".join(str(monitor) for monitor in self.monitors))
             return self._present(frame, unchanged)
         except (PanelLost, glfw.GLFWError, moderngl.Error) as error:
             self._lost = str(error)
-            self._context_lost = self._context_lost or not isinstance(error, PanelLost)
+            self._context_lost = isinstance(error, ContextLost) or not isinstance(error, PanelLost)
             self._retreat()
             raise PanelLost(self._lost) from error
         finally:
@@ -127,41 +127,19 @@ class WindowPanels(PanelSink):
         self._give_back()
 
     def _present(self, frame: PanelFrame, unchanged: bool) -> PresentReport:
-        display, textures, watch = self._display, self._textures, self._watch
-        assert display is not None and textures is not None and watch is not None
+        display, windows, watch = self._display, self._windows, self._watch
+        assert display is not None and windows is not None and watch is not None
         if fault := display.poll() or watch.look():
             raise PanelLost(fault)
-        if unchanged and self._shown:
+        if unchanged and self._shown and not windows.damaged:
             return PresentReport(frame.number, self._clock.now_ns(), 0.0)
-        self._away = True
-        if any(textures.lacks(frame)):
-            display.root.make_current()
-            textures.upload(frame)
-            # The other contexts may not use the textures until the upload has finished.
-            display.root.context.finish()
-        for panel, (window, painter) in enumerate(self._surfaces):
-            self._draw(panel, window, painter, textures, frame)
-        swapped_ns = [self._swap(window) for window, _ in self._surfaces]
+        self._away = windows.opengl
+        windows.draw(frame)
+        first_ns, last_ns = windows.show(self._clock)
         self._shown = True
-        return PresentReport(
-            frame.number, swapped_ns[-1], (swapped_ns[-1] - swapped_ns[0]) / NS_PER_MS, vblank_ns=swapped_ns[0]
-        )
-
-    def _draw(self, panel: int, window: Window, painter: Painter, textures: FrameTextures, frame: PanelFrame) -> None:
-        window.make_current()
-        context = window.context
-        context.screen.use()
-        context.viewport = (0, 0, self.monitors[panel].width_px, self.monitors[panel].height_px)
-        painter.draw(textures, frame, panel)
-        context.finish()
-        if fault := _reset_status() or _error(context):
-            self._context_lost = True
-            raise PanelLost(f"the OpenGL context of panel {panel} failed: {fault}")
-
-    def _swap(self, window: Window) -> int:
-        window.make_current()
-        glfw.swap_buffers(window.handle)
-        return self._clock.now_ns()
+        blank_ns = first_ns if windows.opengl else None
+        skew_ms = (last_ns - first_ns) / NS_PER_MS
+        return PresentReport(frame.number, last_ns, skew_ms, vblank_ns=blank_ns)
 
     def _may_try(self) -> bool:
         """Return True if the delay before reopening is over or the connected monitors have changed."""
@@ -180,15 +158,11 @@ class WindowPanels(PanelSink):
             check_modes(self._panels, self.monitors, width_px=layer_px[0], height_px=layer_px[1])
         if difference := refresh_difference(self.monitors):
             log.warning("%s", difference)
-        display.root.make_current()
-        self._textures = FrameTextures(display.root.context, layer_px, count=len(self._panels))
-        for number, (panel, monitor) in enumerate(zip(self._panels, self.monitors, strict=True)):
-            window = display.fullscreen_window(monitor, title=f"panel {number}")
-            screen_px = monitor.width_px, monitor.height_px
-            self._surfaces.append((window, Painter(window.context, panel, screen_px=screen_px, layer_px=layer_px)))
-            glfw.swap_interval(1 if number == 0 else 0)
+        self._windows = windows = open_windows(
+            display, self._panels, self.monitors, layer_px=layer_px, clock=self._clock, on_processor=self._on_processor
+        )
         glfw.poll_events()
-        self._watch = PlacementWatch(display, self.monitors, [window for window, _ in self._surfaces], self._clock)
+        self._watch = PlacementWatch(display, self.monitors, windows.windows, self._clock)
 
     def _retreat(self) -> None:
         """Close the windows after a failure, but keep the shared context if it is intact."""
@@ -202,13 +176,9 @@ class WindowPanels(PanelSink):
     def _close_windows(self, display: Display) -> None:
         self._away = True
         try:
+            if self._windows is not None:
+                self._windows.release()
             display.root.make_current()
-            for window, painter in self._surfaces:
-                window.make_current()
-                painter.release()
-            display.root.make_current()
-            if self._textures is not None:
-                self._textures.release()
             display.close_windows()
         except Exception:
             log.exception("error while closing the windows")
@@ -220,16 +190,19 @@ class WindowPanels(PanelSink):
         display, self._display = self._display, None
         self.contexts_lost += self._context_lost
         self._context_lost = False
+        windows = self._windows
         self._forget()
         if display is not None:
             try:
+                if windows is not None:
+                    windows.abandon()
                 display.close()
             except Exception:
                 log.exception("error while closing the display")
 
     def _forget(self) -> None:
         """Clear all state kept for the closed windows, and schedule reopening them."""
-        self._surfaces, self._textures, self._watch, self._shown = [], None, None, False
+        self._windows, self._watch, self._shown = None, None, False
         self._retry_ns = self._clock.now_ns() + RETRY_NS
 
     def _give_back(self) -> None:
@@ -237,18 +210,6 @@ class WindowPanels(PanelSink):
             content: Any = self._content
             content.__enter__()
             self._away = False
-
-
-def _error(context: moderngl.Context) -> str:
-    fault = context.error
-    return "" if fault == "GL_NO_ERROR" else fault
-
-
-def _reset_status() -> str:
-    """Return the driver's status after a GPU reset, or "" if the GPU has not been reset."""
-    address = gl_function("glGetGraphicsResetStatus")
-    status: int = ctypes.CFUNCTYPE(ctypes.c_uint)(address)() if address else 0
-    return f"the driver reset the GPU (0x{status:x})" if status else ""
 
 
 def every_monitor() -> tuple[WindowPanels, list[U8], tuple[Monitor, ...]]:

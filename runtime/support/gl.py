@@ -92,3 +92,9 @@ def describe(context: moderngl.Context) -> dict[str, str]:
     """Return the vendor, renderer and version reported by the OpenGL driver."""
     info = context.info
     return {"vendor": str(info["GL_VENDOR"]), "renderer": str(info["GL_RENDERER"]), "version": str(info["GL_VERSION"])}
+
+
+def draws_in_software(context: moderngl.Context) -> bool:
+    """Return True if the OpenGL driver draws on the processor."""
+    renderer = describe(context)["renderer"].lower()
+    return any(name in renderer for name in ("llvmpipe", "softpipe", "swrast"))

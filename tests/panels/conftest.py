@@ -9,18 +9,23 @@ import moderngl
 import pytest
 
 from runtime.clock import MonotonicClock
-from runtime.config import OutputSettings, PanelSettings
+from runtime.config import PanelSettings
 from runtime.optics.stack import PanelStack
-from runtime.panels.registry import open_panels
+from runtime.panels.window import WindowPanels
 from runtime.support.gl import offscreen_context
 from tests.panels import xserver
 
 
 @pytest.fixture(scope="session")
-def context() -> Iterator[moderngl.Context]:
+def gl() -> Iterator[moderngl.Context]:
     made = offscreen_context()
     yield made
     made.release()
+
+
+@pytest.fixture
+def context(gl: moderngl.Context) -> moderngl.Context:
+    return gl
 
 
 @pytest.fixture(scope="module")
@@ -39,15 +44,20 @@ def x(screen: xserver.XServer, monkeypatch: pytest.MonkeyPatch) -> Iterator[xser
     screen.xrandr("--query")
 
 
+@pytest.fixture(params=["processor", "opengl"])
+def drawn_by(request: pytest.FixtureRequest) -> str:
+    """What draws in the windows."""
+    return str(request.param)
+
+
 @pytest.fixture
-def opened(x: xserver.XServer, context: moderngl.Context) -> Iterator[Callable[..., Any]]:
+def opened(x: xserver.XServer, gl: moderngl.Context, drawn_by: str) -> Iterator[Callable[..., Any]]:
     """Opens windows that are closed at the end."""
     sinks = []
 
     def open_(*panels: PanelSettings) -> Any:
-        output = OutputSettings(kind="windows", panels=panels)
         stack = PanelStack(0.5, 0.28, (-0.06, 0.0, 0.06), xserver.WIDTH_PX, xserver.HEIGHT_PX)
-        sinks.append(open_panels(output, stack, MonotonicClock(), context))
+        sinks.append(WindowPanels(panels, stack, MonotonicClock(), gl, on_processor=drawn_by == "processor"))
         return sinks[-1]
 
     yield open_

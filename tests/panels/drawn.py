@@ -1,4 +1,4 @@
-"""Offscreen panels that draw with the presentation shader what monitors would receive, and read it back."""
+"""Offscreen panels that draw what monitors would receive, by the shader or on the processor, and read it back."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 from runtime.clock import Clock
 from runtime.config import PanelSettings
 from runtime.panels.presentation import FrameTextures, Painter
+from runtime.panels.processor import Mounting, ProcessorPainter
 from runtime.panels.registry import OffscreenPanels
 from runtime.records import U8, PanelFrame, PresentReport
 
@@ -58,3 +59,31 @@ class DrawnPanels(OffscreenPanels):
         self._textures.release()
         self._painters, self._targets = [], []
         super().close()
+
+
+class ProcessorDrawnPanels(OffscreenPanels):
+    """Offscreen panels drawn on the processor."""
+
+    def __init__(self, *, clock: Clock, size_px: tuple[int, int], panels: tuple[PanelSettings, ...]) -> None:
+        super().__init__(clock)
+        self._screens, mountings = [], []
+        for settings in panels:
+            screen = size_px[::-1] if settings.rotation_deg in (90, 270) else size_px
+            mounting = Mounting.of(settings, screen_px=screen, layer_px=size_px)
+            assert mounting is not None
+            mountings.append(mounting)
+            self._screens.append(np.zeros((*screen[::-1], 4), np.uint8))
+        self._painter = ProcessorPainter(panels, mountings, self._screens)
+
+    def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
+        self._frame = frame
+        return super().present(frame, unchanged=unchanged)
+
+    def drawn(self, frame: PanelFrame) -> list[int]:
+        """Numbers of the panels that a frame changes."""
+        return self._painter.draw(frame)
+
+    def read_back(self) -> tuple[U8, ...]:
+        """The monitors' pictures of the last frame, rear to front: (h, w, 4) RGBA each, top row first."""
+        self._painter.draw(self._frame)
+        return tuple(screen[..., [2, 1, 0, 3]] for screen in self._screens)

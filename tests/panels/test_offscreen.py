@@ -1,4 +1,4 @@
-"""Tests the pixels sent to each monitor, drawn by the real shader."""
+"""Tests the pixels sent to each monitor, drawn by the real shader and on the processor."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from runtime.config import PanelSettings
 from runtime.optics.alignment import align, shown_layers
 from runtime.optics.stack import PanelStack
 from runtime.records import U8, PanelFrame
-from tests.panels.drawn import DrawnPanels
+from tests.panels.drawn import DrawnPanels, ProcessorDrawnPanels
 
 WIDTH, HEIGHT = 48, 32
 TINY = PanelStack(0.5, 0.3, (-0.1, 0.0, 0.1), WIDTH, HEIGHT)
@@ -27,11 +27,29 @@ def layers() -> NDArray[np.uint8]:
     return np.random.default_rng(7).integers(0, 256, (3, HEIGHT, WIDTH, 4), dtype=np.uint8)
 
 
-def offscreen(context: moderngl.Context, stack: PanelStack, *panels: PanelSettings) -> DrawnPanels:
-    return DrawnPanels(context, clock=SimulatedClock(), size_px=(stack.width_px, stack.height_px), panels=panels)
+Drawn = DrawnPanels | ProcessorDrawnPanels
+BOTH = pytest.mark.parametrize("context", ["shader", "processor"], indirect=True)
 
 
-def shown(context: moderngl.Context, layers: NDArray[np.uint8], *panels: PanelSettings) -> list[NDArray[np.uint8]]:
+@pytest.fixture
+def context(request: pytest.FixtureRequest) -> moderngl.Context | None:
+    """Context of the shader; None: the processor draws."""
+    if getattr(request, "param", "shader") == "processor":
+        return None
+    made: moderngl.Context = request.getfixturevalue("gl")
+    return made
+
+
+def offscreen(context: moderngl.Context | None, stack: PanelStack, *panels: PanelSettings) -> Drawn:
+    size_px = stack.width_px, stack.height_px
+    if context is None:
+        return ProcessorDrawnPanels(clock=SimulatedClock(), size_px=size_px, panels=panels)
+    return DrawnPanels(context, clock=SimulatedClock(), size_px=size_px, panels=panels)
+
+
+def shown(
+    context: moderngl.Context | None, layers: NDArray[np.uint8], *panels: PanelSettings
+) -> list[NDArray[np.uint8]]:
     sink = offscreen(context, TINY, *panels)
     try:
         sink.present(PanelFrame(1, layers, 1))
@@ -40,10 +58,11 @@ def shown(context: moderngl.Context, layers: NDArray[np.uint8], *panels: PanelSe
         sink.close()
 
 
+@BOTH
 @pytest.mark.parametrize(("rotation_deg", "clockwise_quarters"), [(0, 0), (90, 1), (180, 2), (270, 3)])
 @pytest.mark.parametrize(("mirror", "axis"), [("none", None), ("horizontal", 1), ("vertical", 0)])
 def test_a_mounted_panel_s_picture_is_mirrored_then_turned(
-    context: moderngl.Context,
+    context: moderngl.Context | None,
     layers: NDArray[np.uint8],
     rotation_deg: int,
     clockwise_quarters: int,
@@ -86,7 +105,8 @@ def test_a_horizon_just_beyond_the_panel_darkens_nothing(
     assert (picture[: HEIGHT // 3, : WIDTH // 2] == 200).all()
 
 
-def test_each_channel_goes_through_its_own_curve(context: moderngl.Context, tmp_path: Path) -> None:
+@BOTH
+def test_each_channel_goes_through_its_own_curve(context: moderngl.Context | None, tmp_path: Path) -> None:
     path = tmp_path / "curve.csv"
     path.write_text("phase,red,green,blue\n0,0,1,0.5\n1,1,0,0.5\n")
     ramp = np.zeros((1, HEIGHT, WIDTH, 4), np.uint8)
@@ -113,7 +133,7 @@ def smooth(seed: int) -> np.ndarray:
 
 
 @pytest.fixture
-def sink(context: moderngl.Context) -> Iterator[DrawnPanels]:
+def sink(context: moderngl.Context | None) -> Iterator[Drawn]:
     made = offscreen(context, STACK, *(PanelSettings(),) * STACK.count)
     yield made
     made.close()
@@ -123,12 +143,13 @@ def codes(pictures: NDArray[np.uint8] | tuple[NDArray[np.uint8], NDArray[np.uint
     return np.stack(pictures)[..., :3].astype(int)
 
 
+@BOTH
 @pytest.mark.parametrize("flatness", [0.0, 0.3, 1.0])
 @pytest.mark.parametrize(
     "step_m", [(0.0, 0.004, 0.0), (0.01, 0.016, 0.008), (-0.3, -0.1, 0.05), (1.0, 0.9, -0.2), (0.0, 9.0, 0.0)]
 )
 def test_the_shader_shows_what_its_reference_says(
-    sink: DrawnPanels, step_m: tuple[float, float, float], flatness: float
+    sink: Drawn, step_m: tuple[float, float, float], flatness: float
 ) -> None:
     matrices = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array(step_m)).solved_from_shown
     frame = PanelFrame(1, smooth(1), 1, matrices, smooth(2), 1, flatness)
@@ -138,7 +159,8 @@ def test_the_shader_shows_what_its_reference_says(
     assert (difference <= 1).mean() >= 0.999
 
 
-def test_an_unaligned_panel_is_exact_to_the_bit_beside_aligned_ones(sink: DrawnPanels) -> None:
+@BOTH
+def test_an_unaligned_panel_is_exact_to_the_bit_beside_aligned_ones(sink: Drawn) -> None:
     frame = PanelFrame(1, smooth(1), 1, align(STACK, solved_for_m=HEAD, eyes_m=HEAD * 1.01).solved_from_shown)
     sink.present(frame)
     assert np.array_equal(codes(sink.read_back())[1], codes(frame.solved)[1])
@@ -157,6 +179,7 @@ def test_a_registered_panel_is_aligned_first_then_warped_by_its_registration(con
     sink.close()
 
 
+@BOTH
 def test_a_gamma_is_applied_to_what_is_aligned_and_mixed(context: moderngl.Context) -> None:
     gamma = (PanelSettings(gamma=2.0),) * 3
     sink = offscreen(context, STACK, *gamma)
@@ -193,16 +216,18 @@ def test_a_solution_is_uploaded_once_however_often_it_is_aligned_and_shown(
     assert [id(layers) for layers in written[2:]] == [id(other)]
 
 
-def test_a_new_solution_is_recognised_by_its_version_alone(sink: DrawnPanels) -> None:
+@BOTH
+def test_a_new_solution_is_recognised_by_its_version_alone(sink: Drawn) -> None:
     for version in (1, 2):
         sink.present(PanelFrame(version, smooth(version), version))
         assert np.array_equal(codes(sink.read_back()), codes(smooth(version)))
 
 
+@BOTH
 @pytest.mark.parametrize("reduction", [1, 2])
 @pytest.mark.parametrize("step_m", [(0.0, 0.004, 0.0), (0.01, 0.016, 0.008), (-0.1, -0.1, 0.05)])
 def test_content_moves_by_its_relief_as_the_reference_says(
-    sink: DrawnPanels, step_m: tuple[float, float, float], reduction: int
+    sink: Drawn, step_m: tuple[float, float, float], reduction: int
 ) -> None:
     v, u = np.mgrid[0:27, 0:48] / 8
     relief = np.asarray(0.15 * np.sin(u) * np.cos(v), np.float32)
@@ -218,9 +243,10 @@ def test_content_moves_by_its_relief_as_the_reference_says(
     assert np.abs(codes(shown_layers(frame)) - codes(shown_layers(replace(frame, relief=None)))).max() > 20
 
 
+@BOTH
 @pytest.mark.parametrize("reduction", [2, 4])
 @pytest.mark.parametrize("moved_m", [0.0, 0.016])
-def test_a_coarse_solution_is_enlarged_as_the_reference_does(sink: DrawnPanels, reduction: int, moved_m: float) -> None:
+def test_a_coarse_solution_is_enlarged_as_the_reference_does(sink: Drawn, reduction: int, moved_m: float) -> None:
     coarse = np.ascontiguousarray(smooth(1)[:, ::reduction, ::reduction])
     matrices = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([0.0, moved_m, 0.0])).solved_from_shown
     frame = PanelFrame(1, coarse, 1, matrices, size_px=(STACK.width_px, STACK.height_px))
@@ -232,8 +258,55 @@ def test_a_coarse_solution_is_enlarged_as_the_reference_does(sink: DrawnPanels, 
     assert np.array_equal(codes(sink.read_back()), codes(smooth(3)))
 
 
-def test_an_even_coarse_solution_reaches_the_panel_s_edge(sink: DrawnPanels) -> None:
+@BOTH
+def test_an_even_coarse_solution_reaches_the_panel_s_edge(sink: Drawn) -> None:
     even = np.full((3, STACK.height_px // 2, STACK.width_px // 2, 4), 200, np.uint8)
     sink.present(frame := PanelFrame(1, even, 1, (), size_px=(STACK.width_px, STACK.height_px)))
     assert (shown_layers(frame)[..., :3] == 200).all()
     assert (codes(sink.read_back()) == 200).all()
+
+
+@pytest.mark.parametrize("rotation_deg", [0, 90, 180, 270])
+@pytest.mark.parametrize("mirror", ["none", "horizontal", "vertical"])
+@pytest.mark.parametrize("reduction", [1, 3])
+def test_a_mounted_panel_is_aligned_and_displaced_as_the_viewer_sees_it(
+    rotation_deg: int, mirror: str, reduction: int
+) -> None:
+    """Drawn on the processor, which turns pictures before it samples them."""
+    v, u = np.mgrid[0:40, 0:60] / 8
+    relief = np.asarray(np.maximum(0.1 * np.sin(u) * np.cos(v), 0.0), np.float32)  # flat between the hills
+    moved = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([0.02, 0.016, -0.01]))
+    layers = np.ascontiguousarray(smooth(1)[:, ::reduction, ::reduction])
+    size_px = STACK.width_px, STACK.height_px
+    frame = PanelFrame(
+        1, layers, 1, moved.solved_from_shown, smooth(2), 1, 0.3, size_px, relief, moved.parallax
+    )  # fmt: skip
+    settings = PanelSettings(rotation_deg=rotation_deg, mirror=mirror)
+    sink = ProcessorDrawnPanels(clock=SimulatedClock(), size_px=size_px, panels=(settings,) * 3)
+    sink.present(frame)
+    for picture, seen in zip(sink.read_back(), shown_layers(frame), strict=True):
+        mirrored = {"none": seen, "horizontal": seen[:, ::-1], "vertical": seen[::-1]}[mirror]
+        difference = np.abs(picture[..., :3].astype(int) - np.rot90(mirrored, -rotation_deg // 90)[..., :3])
+        assert (difference <= 1).mean() >= 0.999 and difference.max() <= 2
+
+
+def test_on_the_processor_only_panels_that_change_are_drawn() -> None:
+    sink = ProcessorDrawnPanels(
+        clock=SimulatedClock(), size_px=(STACK.width_px, STACK.height_px), panels=(PanelSettings(),) * 3
+    )
+    alike, moved = align(STACK, solved_for_m=HEAD, eyes_m=HEAD), align(STACK, solved_for_m=HEAD, eyes_m=HEAD * 1.01)
+    layers = smooth(1)
+    assert sink.drawn(PanelFrame(1, layers, 1, alike.solved_from_shown)) == [0, 1, 2]
+    assert sink.drawn(PanelFrame(2, layers, 1, moved.solved_from_shown)) == [0, 2]
+    assert sink.drawn(PanelFrame(3, layers, 1, moved.solved_from_shown)) == []
+    assert sink.drawn(PanelFrame(4, smooth(2), 2, moved.solved_from_shown)) == [0, 1, 2]
+
+
+def test_a_relief_that_is_not_a_number_harms_nothing() -> None:
+    relief = np.full((20, 30), np.nan, np.float32)
+    relief[:10] = np.inf
+    moved = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([0.0, 0.016, 0.0]))
+    sink = ProcessorDrawnPanels(
+        clock=SimulatedClock(), size_px=(STACK.width_px, STACK.height_px), panels=(PanelSettings(),) * 3
+    )
+    sink.drawn(PanelFrame(1, smooth(1), 1, moved.solved_from_shown, relief=relief, parallax=moved.parallax))

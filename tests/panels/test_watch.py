@@ -117,7 +117,7 @@ def test_where_nothing_happens_nothing_is_lost(opened: Callable[..., Any]) -> No
 
 def test_a_refused_request_makes_it_look_at_everything_at_once(x: XServer, opened: Callable[..., Any]) -> None:
     sink = opened(*BY_CONNECTOR)
-    windows = [window for window, _ in sink._surfaces]
+    windows = sink._windows.windows
     watch = PlacementWatch(sink._display, sink.monitors, windows, SimulatedClock())  # whose time never comes
     x.do_to_window("XDestroyWindow", x11_window(sink, 2))
     x.xrandr("--query")

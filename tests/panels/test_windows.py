@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import shutil
+import subprocess
+import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +18,7 @@ from runtime.config import PanelSettings
 from runtime.errors import PanelLost
 from runtime.optics.alignment import align, shown_layers
 from runtime.optics.stack import PanelStack
-from runtime.panels import window
+from runtime.panels import drawing
 from runtime.panels.display import glfw
 from runtime.panels.window import WindowPanels
 from runtime.records import PanelFrame
@@ -38,6 +43,8 @@ def frame(number: int) -> PanelFrame:
     return PanelFrame(number, np.stack([picture(number, index) for index in range(3)]), number)
 
 
+OPENGL = pytest.mark.parametrize("drawn_by", ["opengl"])
+PROCESSOR = pytest.mark.parametrize("drawn_by", ["processor"])
 BY_CONNECTOR = tuple(PanelSettings(connector=f"DUMMY{index}") for index in (2, 0, 1))
 
 
@@ -115,6 +122,7 @@ def test_the_aligned_picture_is_on_all_panels_in_the_same_frame(x: XServer, open
         assert (difference() <= 1).mean() >= 0.999
 
 
+@OPENGL
 def test_the_pacer_gets_the_time_and_period_of_vertical_blanks(opened: Callable[..., Any]) -> None:
     sink = opened(*BY_CONNECTOR)
     assert sink.period_ns == pytest.approx(1e9 / 60, rel=1e-3)
@@ -124,6 +132,7 @@ def test_the_pacer_gets_the_time_and_period_of_vertical_blanks(opened: Callable[
     assert sink.present(moved(1), unchanged=True).vblank_ns is None  # no swap
 
 
+@OPENGL  # nothing can fail on the processor
 def test_a_fault_while_drawing_leaves_the_new_frame_on_no_panel(
     x: XServer, opened: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -131,7 +140,7 @@ def test_a_fault_while_drawing_leaves_the_new_frame_on_no_panel(
     assert presents(sink, 0)
     with monkeypatch.context() as patch:
         patch.setattr(
-            window, "_reset_status", lambda: "the driver reset the GPU (0x8253)"
+            drawing, "_reset_status", lambda: "the driver reset the GPU (0x8253)"
         )  # no software driver ever loses one
         with pytest.raises(PanelLost, match="context of panel 0 failed: the driver reset"):
             sink.present(frame(1))
@@ -161,3 +170,45 @@ def test_a_lost_monitor_is_named_and_used_again_for_unchanged_frames(x: XServer,
 
     assert eventually(shown_again)
     assert shows(x, 2, picture(50, 0)) and shows(x, 1, picture(50, 2))
+
+
+@PROCESSOR
+def test_a_picture_that_another_window_covered_is_shown_again(x: XServer, opened: Callable[..., Any]) -> None:
+    sink = opened(*BY_CONNECTOR)
+    assert presents(sink, 0)
+    with x.covered(2):
+        assert eventually(lambda: not np.array_equal(x.panel(2), picture(0, 0)[..., :3]))
+
+    def shown_again() -> bool:
+        sink.present(frame(0), unchanged=True)
+        return bool(np.array_equal(x.panel(2), picture(0, 0)[..., :3]))
+
+    assert eventually(shown_again)
+
+
+@PROCESSOR
+def test_a_registered_panel_is_drawn_by_opengl(opened: Callable[..., Any], caplog: pytest.LogCaptureFixture) -> None:
+    bent = ((1.0, 0.01, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    sink = opened(PanelSettings(connector="DUMMY2", homography=bent), *BY_CONNECTOR[1:])
+    assert presents(sink, 0)
+    assert "a panel's homography needs OpenGL" in caplog.text
+
+
+@pytest.mark.skipif(os.getuid() != 0 or shutil.which("unshare") is None, reason="needs root and unshare")
+def test_without_memory_shared_with_the_x_server_opengl_draws(x: XServer) -> None:
+    """As in a container with an IPC namespace of its own."""
+    script = """
+from tests.panels.test_windows import BY_CONNECTOR, STACK, frame
+from runtime.clock import MonotonicClock
+from runtime.panels.window import WindowPanels
+from runtime.support.gl import offscreen_context
+
+sink = WindowPanels(BY_CONNECTOR, STACK, MonotonicClock(), offscreen_context(), on_processor=True)
+print(type(sink._windows).__name__, sink.present(frame(3)).number)
+"""
+    done = subprocess.run(
+        ["unshare", "--ipc", sys.executable, "-c", script],
+        cwd=Path(__file__).parents[2], capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert done.stdout == "ShaderWindows 3\n", done.stderr
+    assert "the X server cannot reach this process's memory" in done.stderr

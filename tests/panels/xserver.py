@@ -178,6 +178,20 @@ class XServer:
             getattr(x11, request)(display, ctypes.c_ulong(window), *arguments)
 
     @contextmanager
+    def covered(self, index: int) -> Iterator[None]:
+        """A window of another program in front of monitor `index`."""
+        with self._connected() as (x11, display):
+            x11.XCreateSimpleWindow.restype = ctypes.c_ulong
+            root, grey = ctypes.c_ulong(x11.XDefaultRootWindow(display)), ctypes.c_ulong(0x808080)
+            place = WIDTH_PX * index, 0, WIDTH_PX, HEIGHT_PX
+            window = ctypes.c_ulong(x11.XCreateSimpleWindow(display, root, *place, 0, grey, grey))
+            x11.XMapRaised(display, window)
+            x11.XSync(display, 0)
+            yield
+            x11.XDestroyWindow(display, window)
+            x11.XSync(display, 0)
+
+    @contextmanager
     def _connected(self) -> Iterator[tuple[ctypes.CDLL, ctypes.c_void_p]]:
         x11 = ctypes.CDLL("libX11.so.6")
         x11.XOpenDisplay.restype = ctypes.c_void_p

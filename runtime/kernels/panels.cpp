@@ -1,0 +1,260 @@
+// Draw the panels' pictures on the processor (runtime/panels/processor.py): sample a layer, which may be coarse and
+// displaced by the content's relief, mix it with the flat picture and apply the panel's grey curve. Pixels have four
+// bytes. Positions in pictures count from the centre of the top left pixel, positions on the screen from its corner.
+#include <sched.h>
+
+#include <system_error>
+#include <thread>
+#include <vector>
+
+#include "sampling.hpp"
+
+namespace {
+
+constexpr int CURVE = 4096;      // entries of a grey curve for each channel, indexed by sixteenths of a code
+constexpr int FRACTION = 7;      // fractional bits of values while pictures are interpolated and mixed
+constexpr int UNIT = 1 << 15;    // a pixel, and an interpolation weight of 1, in fixed point
+constexpr int BLOCK_PX = 64;     // columns drawn together; where the relief is zero, a block is cheaper
+constexpr int MAX_THREADS = 16;
+
+struct ScaleShift {
+  float scale_u, scale_v, shift_u, shift_v;
+};
+
+struct Shown {
+  const uint8_t *source;  // picture to sample; positions outside it are moved to its edge
+  int64_t source_stride;  // bytes from row to row, as are the other strides
+  uint8_t *screen;        // picture to draw
+  int64_t screen_stride;
+  const uint8_t *flat;  // picture of the screen's size to mix in, or null
+  int64_t flat_stride;
+  const uint8_t *curve;  // (3, CURVE) grey levels for a pixel's first three bytes, or null
+  const float *relief;   // (relief_rows, relief_columns), or null
+  int32_t source_rows, source_columns, rows, columns, relief_rows, relief_columns;
+  ScaleShift source_from_screen, relief_from_screen;
+  ScaleShift push;  // displacement, in the source's pixels, by a relief of 1
+  float flatness;   // weight of `flat`
+};
+
+typedef uint16_t Pair __attribute__((may_alias));  // two of a pixel's bytes
+typedef uint32_t Word __attribute__((may_alias));  // both of a pixel's pairs
+
+struct alignas(2 * LANES) Block {
+  Pair right[2 * BLOCK_PX], down[2 * BLOCK_PX];  // for each pair, weights of the neighbours to the right and below
+  int32_t offset[BLOCK_PX];                      // bytes from the source's first pixel to the top left neighbour
+  Pair near[4][2 * BLOCK_PX];                    // neighbours: top left, top right, bottom left and bottom right
+  int16_t even[2 * BLOCK_PX], odd[2 * BLOCK_PX];  // result: values of each pair's first and second byte
+};
+
+INLINE uint32_t twice(int32_t weight) { return uint32_t(weight) << 16 | uint32_t(weight); }
+INLINE int16_t even_of(uint16_t pair) { return int16_t((pair << FRACTION) & (255 << FRACTION)); }
+INLINE int16_t odd_of(uint16_t pair) { return int16_t((pair >> (8 - FRACTION)) & (255 << FRACTION)); }
+INLINE uint16_t pair_of(int16_t even, int16_t odd) {
+  constexpr int half_code = 1 << (FRACTION - 1);
+  return uint16_t((uint16_t(even + half_code) >> FRACTION) | ((uint16_t(odd + half_code) << (8 - FRACTION)) & 0xFF00));
+}
+INLINE int16_t between(int16_t a, int16_t b, int16_t weight) { return int16_t(a + product(int16_t(b - a), weight)); }
+
+// Return a position in fixed point, moved into a picture of `count` pixels so that a further pixel follows it. The lower
+// 15 bits are the weight of that pixel. A position that is not a number becomes 0.
+INLINE int32_t fixed(float position, int count) {
+  const int32_t at = int32_t(std::min(std::max(position, 0.0f), float(count - 1)) * UNIT);
+  return std::max(std::min(at, (count - 1) * UNIT - 1), 0);
+}
+
+// The relief near a row of the screen, kept while a thread draws a picture from top to bottom.
+struct Relief {
+  std::vector<int32_t> first;    // for each column, the last relief pixel before it
+  std::vector<float> right;      // weight of the next one
+  std::vector<float> lines[2];   // two rows of the relief, resampled to the screen's columns
+  std::vector<uint8_t> rises[2];  // for each of their blocks, whether any relief is not zero
+  int number[2] = {-1, -1};      // numbers of these rows
+};
+
+INLINE void prepare(const Shown &shown, Relief &kept) {
+  const ScaleShift &to = shown.relief_from_screen;
+  kept.first.resize(shown.columns), kept.right.resize(shown.columns);
+  const int last = shown.relief_columns - 1;
+  for (int c = 0; c < shown.columns; ++c) {
+    const float u = std::clamp((float(c) + 0.5f) * to.scale_u + to.shift_u, 0.0f, float(last));
+    kept.first[c] = std::min(int(u), std::max(last - 1, 0));
+    kept.right[c] = u - float(kept.first[c]);
+  }
+  for (int k = 0; k < 2; ++k) kept.lines[k].resize(shown.columns), kept.rises[k].resize(shown.columns / BLOCK_PX + 1);
+}
+
+// Return a row of the relief, resampled to the screen's columns.
+INLINE const float *relief_row(const Shown &shown, Relief &kept, int row) {
+  float *relief = kept.lines[row & 1].data();
+  if (kept.number[row & 1] == row) return relief;
+  kept.number[row & 1] = row;
+  const float *line = shown.relief + int64_t(row) * shown.relief_columns, *next = line + (shown.relief_columns > 1);
+  const int32_t *first = kept.first.data();
+  const float *right = kept.right.data();
+  VECTORISED for (int c = 0; c < shown.columns; ++c)
+    relief[c] = line[first[c]] + (next[first[c]] - line[first[c]]) * right[c];
+  for (int from = 0; from < shown.columns; from += BLOCK_PX) {
+    float most = 0;
+    for (int c = from; c < std::min(from + BLOCK_PX, shown.columns); ++c) most = std::max(most, std::abs(relief[c]));
+    kept.rises[row & 1][from / BLOCK_PX] = most > 0;
+  }
+  return relief;
+}
+
+// Copy a row whose pixels coincide with the source's. Return false if the row must be drawn instead.
+INLINE bool copied(const Shown &shown, int r) {
+  const ScaleShift &at = shown.source_from_screen;
+  const float u = 0.5f + at.shift_u, v = float(r) + 0.5f + at.shift_v;
+  if (shown.relief || shown.flat || shown.curve || at.scale_u != 1 || at.scale_v != 1) return false;
+  if (u != std::floor(u) || v != std::floor(v) || u < 0 || v < 0) return false;
+  if (int(u) + shown.columns > shown.source_columns || int(v) >= shown.source_rows) return false;
+  const uint8_t *from = shown.source + int64_t(v) * shown.source_stride + int64_t(u) * 4;
+  std::memcpy(shown.screen + r * shown.screen_stride, from, size_t(shown.columns) * 4);
+  return true;
+}
+
+// Find the neighbours and weights of a block's pixels. Unless `upper` is null, they are displaced by the relief between
+// two of its rows.
+INLINE void locate(const Shown &shown, int r, int begin, int count, const float *upper, const float *lower, float share, Block &block) {
+  const ScaleShift at = shown.source_from_screen, push = shown.push;
+  const int32_t stride = int32_t(shown.source_stride), rows = shown.source_rows, columns = shown.source_columns;
+  const float v = (float(r) + 0.5f) * at.scale_v + at.shift_v, push_v = (float(r) + 0.5f) * push.scale_v + push.shift_v;
+  auto *right = reinterpret_cast<Word *>(block.right), *down = reinterpret_cast<Word *>(block.down);
+  if (!upper) {
+    const int32_t y = fixed(v, rows), from = y / UNIT * stride;
+    const uint32_t below = twice(y % UNIT);
+    VECTORISED for (int k = 0; k < count; ++k) {
+      const int32_t x = fixed((float(begin + k) + 0.5f) * at.scale_u + at.shift_u, columns);
+      block.offset[k] = from + (x >> 15) * 4, right[k] = twice(x & (UNIT - 1)), down[k] = below;
+    }
+    return;
+  }
+  VECTORISED for (int k = 0; k < count; ++k) {
+    const float u = float(begin + k) + 0.5f, relief = upper[begin + k] + (lower[begin + k] - upper[begin + k]) * share;
+    const int32_t x = fixed(u * at.scale_u + at.shift_u + relief * (u * push.scale_u + push.shift_u), columns);
+    const int32_t y = fixed(v + relief * push_v, rows);
+    block.offset[k] = (y >> 15) * stride + (x >> 15) * 4;
+    right[k] = twice(x & (UNIT - 1)), down[k] = twice(y & (UNIT - 1));
+  }
+}
+
+template <typename Half>
+INLINE int16_t bilinear(const Block &block, int k, Half half) {
+  const int16_t right = int16_t(block.right[k]);
+  return between(between(half(block.near[0][k]), half(block.near[1][k]), right),
+                 between(half(block.near[2][k]), half(block.near[3][k]), right), int16_t(block.down[k]));
+}
+
+// Interpolate a block that has been located.
+INLINE void interpolate(const Shown &shown, int count, Block &block) {
+  auto *top_left = reinterpret_cast<Word *>(block.near[0]), *top_right = reinterpret_cast<Word *>(block.near[1]);
+  auto *bottom_left = reinterpret_cast<Word *>(block.near[2]), *bottom_right = reinterpret_cast<Word *>(block.near[3]);
+  for (int k = 0; k < count; ++k) {
+    uint64_t above, below;  // two neighbours each
+    std::memcpy(&above, shown.source + block.offset[k], 8);
+    std::memcpy(&below, shown.source + block.offset[k] + shown.source_stride, 8);
+    top_left[k] = uint32_t(above), top_right[k] = uint32_t(above >> 32);
+    bottom_left[k] = uint32_t(below), bottom_right[k] = uint32_t(below >> 32);
+  }
+  VECTORISED for (int k = 0; k < 2 * count; ++k)
+    block.even[k] = bilinear(block, k, even_of), block.odd[k] = bilinear(block, k, odd_of);
+}
+
+INLINE void mix_in(const uint8_t *flat, int16_t weight, int count, Block &block) {
+  const auto *pairs = reinterpret_cast<const Pair *>(flat);
+  VECTORISED for (int k = 0; k < 2 * count; ++k) {
+    block.even[k] = between(block.even[k], even_of(pairs[k]), weight);
+    block.odd[k] = between(block.odd[k], odd_of(pairs[k]), weight);
+  }
+}
+
+INLINE void store(const Shown &shown, uint8_t *screen, int count, const Block &block) {
+  if (!shown.curve) {
+    auto *pairs = reinterpret_cast<Pair *>(screen);
+    VECTORISED for (int k = 0; k < 2 * count; ++k) pairs[k] = pair_of(block.even[k], block.odd[k]);
+    return;
+  }
+  const auto entry = [](int16_t value) { return (value + (1 << (FRACTION - 5))) >> (FRACTION - 4); };
+  for (int k = 0; k < count; ++k) {
+    screen[4 * k] = shown.curve[entry(block.even[2 * k])];
+    screen[4 * k + 1] = shown.curve[CURVE + entry(block.odd[2 * k])];
+    screen[4 * k + 2] = shown.curve[2 * CURVE + entry(block.even[2 * k + 1])];
+    screen[4 * k + 3] = 255;
+  }
+}
+
+struct Priority {
+  int policy = 0, level = 0;
+};
+
+#ifdef __linux__
+INLINE Priority priority_here() {
+  sched_param level{};
+  sched_getparam(0, &level);
+  return {std::max(sched_getscheduler(0), 0), level.sched_priority};
+}
+
+// Give this thread a priority that it would not inherit (SCHED_RESET_ON_FORK).
+INLINE void take(Priority priority) {
+  sched_param level{};
+  level.sched_priority = priority.level;
+  sched_setscheduler(0, priority.policy, &level);
+}
+#else
+INLINE Priority priority_here() { return {}; }
+INLINE void take(Priority) {}
+#endif
+
+}  // namespace
+
+FOR_EVERY_CPU void draw_rows(const Shown *given, int begin, int end) {
+  const Shown shown = *given;
+  Block block;
+  Relief kept;
+  if (shown.relief) prepare(shown, kept);
+  for (int r = begin; r < end; ++r) {
+    if (copied(shown, r)) continue;
+    const float *upper = nullptr, *lower = nullptr;
+    float share = 0;
+    if (shown.relief) {
+      const ScaleShift &at = shown.relief_from_screen;
+      const float v = std::clamp((float(r) + 0.5f) * at.scale_v + at.shift_v, 0.0f, float(shown.relief_rows - 1));
+      share = v - float(int(v));
+      upper = relief_row(shown, kept, int(v)), lower = relief_row(shown, kept, std::min(int(v) + 1, shown.relief_rows - 1));
+    }
+    for (int c = 0; c < shown.columns; c += BLOCK_PX) {
+      const int count = std::min(BLOCK_PX, shown.columns - c), n = c / BLOCK_PX;
+      const bool rises = upper && (kept.rises[0][n] || kept.rises[1][n]);
+      locate(shown, r, c, count, rises ? upper : nullptr, lower, share, block);
+      interpolate(shown, count, block);
+      if (shown.flat) {
+        const uint8_t *flat = shown.flat + r * shown.flat_stride + 4 * c;
+        mix_in(flat, int16_t(shown.flatness * (UNIT - 1) + 0.5f), count, block);
+      }
+      store(shown, shown.screen + r * shown.screen_stride + 4 * c, count, block);
+    }
+  }
+}
+
+// Draw pictures on several threads with the caller's priority. Each thread draws the same share of every picture's rows.
+extern "C" void draw_panels(const Shown *shown, int count, int threads) {
+  const int parts = std::clamp(threads, 1, MAX_THREADS);
+  const auto draw = [=](int part) {
+    for (int n = 0; n < count; ++n)
+      draw_rows(shown + n, shown[n].rows * part / parts, shown[n].rows * (part + 1) / parts);
+  };
+  const Priority priority = priority_here();
+  std::thread others[MAX_THREADS];
+  for (int part = 1; part < parts; ++part) {
+    try {
+      others[part] = std::thread([=] { take(priority), draw(part); });
+    } catch (const std::system_error &) {
+      draw(part);
+    }
+  }
+  draw(0);
+  for (auto &other : others)
+    if (other.joinable()) other.join();
+}
+
+extern "C" { extern const int32_t shown_bytes = sizeof(Shown); }

@@ -1,0 +1,274 @@
+"""Fullscreen windows, one for each panel, drawn by OpenGL or, if the PC has no GPU, by the processor."""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import moderngl
+
+from runtime.clock import Clock
+from runtime.config import PanelSettings
+from runtime.errors import PanelLost
+from runtime.panels.display import Display, Window, gl_function, glfw, x_display
+from runtime.panels.monitors import Monitor
+from runtime.panels.presentation import FrameTextures, Painter
+from runtime.panels.processor import Mounting, ProcessorPainter
+from runtime.panels.shared_picture import NotShared, SharedPicture, finish, flush
+from runtime.records import PanelFrame
+from runtime.support.gl import draws_in_software
+
+log = logging.getLogger("phasestack.panels")
+
+
+class ContextLost(PanelLost):
+    """An OpenGL context failed and must be replaced."""
+
+
+class PanelWindows(ABC):
+    """Open windows, rear to front. A frame is drawn for all panels before it is shown on any."""
+
+    opengl: bool  # True if OpenGL draws; then, showing a frame waits for the first monitor's vertical blank
+
+    def __init__(self) -> None:
+        self.windows: list[Window] = []
+
+    @property
+    def damaged(self) -> bool:
+        """True if a window no longer shows the last frame and must be shown again."""
+        return False
+
+    @abstractmethod
+    def draw(self, frame: PanelFrame) -> None:
+        """Draw a frame for all panels, without showing it.
+
+        Raises:
+            ContextLost: An OpenGL context failed.
+        """
+
+    @abstractmethod
+    def show(self, clock: Clock) -> tuple[int, int]:
+        """Show the frame on all panels, one right after another.
+
+        Returns:
+            When the first and the last panel show the frame, on `clock`.
+        """
+
+    @abstractmethod
+    def release(self) -> None:
+        """Release everything except the windows, before they are closed."""
+
+    @abstractmethod
+    def abandon(self) -> None:
+        """Release everything that does not belong to an OpenGL context. Called if the contexts may be lost."""
+
+
+class ShaderWindows(PanelWindows):
+    """Windows drawn by OpenGL, from textures shared by all of them."""
+
+    opengl = True
+
+    def __init__(
+        self, display: Display, panels: Sequence[PanelSettings], monitors: Sequence[Monitor], layer_px: tuple[int, int]
+    ) -> None:
+        """Open the windows.
+
+        Args:
+            display: Connection to the X server.
+            panels: Panel settings, rear to front.
+            monitors: Each panel's monitor.
+            layer_px: Width and height of each of the stack's panels.
+
+        Raises:
+            InputError: A grey curve's file cannot be read or is invalid.
+            PanelLost: A monitor is no longer connected, or the X server does not support OpenGL.
+        """
+        super().__init__()
+        self._display = display
+        display.root.make_current()
+        self._textures = FrameTextures(display.root.gl, layer_px, count=len(panels))
+        self._painters: list[Painter] = []
+        try:
+            for number, (panel, monitor) in enumerate(zip(panels, monitors, strict=True)):
+                window = display.fullscreen_window(monitor, title=f"panel {number}")
+                self.windows.append(window)
+                self._painters.append(Painter(window.gl, panel, screen_px=monitor.size_px, layer_px=layer_px))
+                glfw.swap_interval(1 if number == 0 else 0)
+        except BaseException:
+            self.release()
+            raise
+
+    def draw(self, frame: PanelFrame) -> None:
+        root = self._display.root
+        if any(self._textures.lacks(frame)):
+            root.make_current()
+            self._textures.upload(frame)
+            # The other contexts may not use the textures until the upload has finished.
+            root.gl.finish()
+        for panel, (window, painter) in enumerate(zip(self.windows, self._painters, strict=True)):
+            window.make_current()
+            context = window.gl
+            context.screen.use()
+            context.viewport = (0, 0, *painter.screen_px)
+            painter.draw(self._textures, frame, panel)
+            context.finish()
+            if fault := _reset_status() or _error(context):
+                raise ContextLost(f"the OpenGL context of panel {panel} failed: {fault}")
+
+    def show(self, clock: Clock) -> tuple[int, int]:
+        swapped_ns = []
+        for window in self.windows:
+            window.make_current()
+            glfw.swap_buffers(window.handle)
+            swapped_ns.append(clock.now_ns())
+        return swapped_ns[0], swapped_ns[-1]
+
+    def release(self) -> None:
+        for window, painter in zip(self.windows, self._painters, strict=False):  # the last one may have none
+            window.make_current()
+            painter.release()
+        self._display.root.make_current()
+        self._textures.release()
+
+    def abandon(self) -> None:
+        """Do nothing, because everything belongs to the contexts."""
+
+
+class ProcessorWindows(PanelWindows):
+    """Windows drawn by the processor, into memory shared with the X server. X does not report vertical blanks."""
+
+    opengl = False
+
+    def __init__(
+        self,
+        display: Display,
+        panels: Sequence[PanelSettings],
+        monitors: Sequence[Monitor],
+        mountings: Sequence[Mounting],
+        clock: Clock,
+    ) -> None:
+        """Open the windows.
+
+        Args:
+            display: Connection to the X server.
+            panels: Panel settings, rear to front.
+            monitors: Each panel's monitor.
+            mountings: Each panel's mounting.
+            clock: The run's clock.
+
+        Raises:
+            InputError: A grey curve's file cannot be read or is invalid.
+            NotShared: The X server cannot reach this process's memory.
+            PanelLost: A monitor is no longer connected.
+        """
+        super().__init__()
+        self._pictures: list[SharedPicture] = []
+        self._changed: list[int] = []
+        try:
+            for number, monitor in enumerate(monitors):
+                window = display.fullscreen_window(monitor, title=f"panel {number}", opengl=False)
+                self.windows.append(window)
+                width_px, height_px = monitor.size_px
+                self._pictures.append(
+                    SharedPicture(
+                        x_display(), glfw.get_x11_window(window.handle), width_px=width_px, height_px=height_px
+                    )
+                )
+            screens = [picture.pixels for picture in self._pictures]
+            self._painter = ProcessorPainter(panels, mountings, screens)
+            self._copy_ns = self._measured_copy_ns(clock)
+        except BaseException:
+            self.release()
+            raise
+
+    @property
+    def damaged(self) -> bool:
+        return any(window.exposed for window in self.windows)
+
+    def draw(self, frame: PanelFrame) -> None:
+        finish(x_display())  # the X server may still be copying the last frame
+        self._changed = self._painter.draw(frame)
+
+    def show(self, clock: Clock) -> tuple[int, int]:
+        for panel, (window, picture) in enumerate(zip(self.windows, self._pictures, strict=True)):
+            if panel in self._changed or window.exposed:
+                window.exposed = False
+                picture.put()
+        flush(x_display())
+        # The X server copies the pictures meanwhile. Waiting for it would leave too little time to draw the next frame.
+        now_ns = clock.now_ns()
+        return now_ns + self._copy_ns, now_ns + len(self._pictures) * self._copy_ns
+
+    def release(self) -> None:
+        for picture in self._pictures:
+            picture.close()
+
+    def _measured_copy_ns(self, clock: Clock) -> int:
+        """Return how long the X server takes to copy a picture, from copying each of them, while it is black."""
+        finish(x_display())
+        began_ns = clock.now_ns()
+        for picture in self._pictures:
+            picture.put()
+        finish(x_display())
+        return (clock.now_ns() - began_ns) // len(self._pictures)
+
+    def abandon(self) -> None:
+        self.release()
+
+
+def open_windows(
+    display: Display,
+    panels: Sequence[PanelSettings],
+    monitors: Sequence[Monitor],
+    *,
+    layer_px: tuple[int, int],
+    clock: Clock,
+    on_processor: bool | None = None,
+) -> PanelWindows:
+    """Open a fullscreen window for each panel.
+
+    Args:
+        display: Connection to the X server.
+        panels: Panel settings, rear to front.
+        monitors: Each panel's monitor.
+        layer_px: Width and height of each of the stack's panels.
+        clock: The run's clock.
+        on_processor: True to draw on the processor if that is possible, False to draw by OpenGL, or None to draw on the
+            processor if OpenGL would too.
+
+    Raises:
+        InputError: A grey curve's file cannot be read or is invalid.
+        PanelLost: A monitor is no longer connected, or the X server does not support OpenGL.
+    """
+    root = display.root  # must be the first window
+    if on_processor is None:
+        on_processor = draws_in_software(root.gl)
+    if on_processor:
+        found = [
+            Mounting.of(panel, screen_px=monitor.size_px, layer_px=layer_px)
+            for panel, monitor in zip(panels, monitors, strict=True)
+        ]
+        mountings = [mounting for mounting in found if mounting is not None]
+        if len(mountings) == len(panels):
+            try:
+                return ProcessorWindows(display, panels, monitors, mountings, clock)
+            except NotShared as error:
+                log.warning("there is no GPU, and %s: drawing will be slow", error)
+                display.close_windows()
+        else:
+            log.warning("there is no GPU, and a panel's homography needs OpenGL: drawing will be slow")
+    return ShaderWindows(display, panels, monitors, layer_px)
+
+
+def _error(context: moderngl.Context) -> str:
+    fault = context.error
+    return "" if fault == "GL_NO_ERROR" else fault
+
+
+def _reset_status() -> str:
+    """Return the driver's status after a GPU reset, or "" if the GPU has not been reset."""
+    address = gl_function("glGetGraphicsResetStatus")
+    status: int = ctypes.CFUNCTYPE(ctypes.c_uint)(address)() if address else 0
+    return f"the driver reset the GPU (0x{status:x})" if status else ""

@@ -1,0 +1,200 @@
+"""Pictures in memory shared with the X server, using X's MIT-SHM extension through ctypes.
+
+The X server copies such a picture to its window without it passing through the connection.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import os
+from ctypes import POINTER, byref, c_char_p, c_int, c_uint, c_ulong, c_void_p
+from typing import Any
+
+import numpy as np
+
+from runtime.panels import xlib
+from runtime.records import U8
+
+PRIVATE, CREATE, OWNER_ONLY, REMOVE = 0, 0o1000, 0o600, 0  # arguments of shmget and shmctl
+Z_PIXMAP, ALL_PLANES = 2, 0xFFFFFFFF
+
+
+class NotShared(Exception):
+    """Memory cannot be shared with the X server, for example because it runs on another computer."""
+
+
+class _Segment(ctypes.Structure):
+    _fields_ = (("segment", c_ulong), ("id", c_int), ("address", c_void_p), ("read_only", c_int))
+
+
+class _Visual(ctypes.Structure):
+    """First fields of Xlib's `Visual`."""
+
+    _fields_ = (
+        ("extension_data", c_void_p), ("id", c_ulong), ("kind", c_int),
+        ("red_mask", c_ulong), ("green_mask", c_ulong), ("blue_mask", c_ulong),
+    )  # fmt: skip
+
+
+class _Image(ctypes.Structure):
+    """First fields of Xlib's `XImage`."""
+
+    _fields_ = (
+        *((name, c_int) for name in ("width", "height", "offset", "format")), ("data", c_void_p),
+        *((name, c_int) for name in ("byte_order", "unit", "bit_order", "pad", "depth", "stride", "pixel_bits")),
+    )  # fmt: skip
+
+
+@functools.cache
+def _libraries() -> tuple[ctypes.CDLL, ctypes.CDLL, ctypes.CDLL]:
+    x11, extensions, system = (
+        ctypes.CDLL("libX11.so.6"), ctypes.CDLL("libXext.so.6"), ctypes.CDLL(None, use_errno=True)
+    )  # fmt: skip
+    x11.XDefaultScreen.argtypes = [c_void_p]
+    x11.XDefaultDepth.argtypes = [c_void_p, c_int]
+    x11.XDefaultVisual.restype, x11.XDefaultVisual.argtypes = POINTER(_Visual), [c_void_p, c_int]
+    x11.XCreateGC.restype, x11.XCreateGC.argtypes = c_void_p, [c_void_p, c_ulong, c_ulong, c_void_p]
+    x11.XFreeGC.argtypes = [c_void_p, c_void_p]
+    x11.XSync.argtypes = [c_void_p, c_int]
+    x11.XFlush.argtypes = [c_void_p]
+    x11.XFree.argtypes = [c_void_p]
+    x11.XCreatePixmap.restype, x11.XCreatePixmap.argtypes = c_ulong, [c_void_p, c_ulong, c_uint, c_uint, c_uint]
+    x11.XFreePixmap.argtypes = [c_void_p, c_ulong]
+    x11.XGetImage.restype = POINTER(_Image)
+    x11.XGetImage.argtypes = [c_void_p, c_ulong, c_int, c_int, c_uint, c_uint, c_ulong, c_int]
+    x11.XDestroyImage.argtypes = [POINTER(_Image)]
+    extensions.XShmQueryExtension.argtypes = [c_void_p]
+    extensions.XShmCreateImage.restype = POINTER(_Image)
+    extensions.XShmCreateImage.argtypes = [
+        c_void_p, POINTER(_Visual), c_uint, c_int, c_char_p, POINTER(_Segment), c_uint, c_uint,
+    ]  # fmt: skip
+    extensions.XShmAttach.argtypes = extensions.XShmDetach.argtypes = [c_void_p, POINTER(_Segment)]
+    extensions.XShmPutImage.argtypes = [
+        c_void_p, c_ulong, c_void_p, POINTER(_Image), c_int, c_int, c_int, c_int, c_uint, c_uint, c_int,
+    ]  # fmt: skip
+    system.shmget.argtypes = [c_int, ctypes.c_size_t, c_int]
+    system.shmat.restype, system.shmat.argtypes = c_void_p, [c_int, c_void_p, c_int]
+    system.shmdt.argtypes = [c_void_p]
+    system.shmctl.argtypes = [c_int, c_int, c_void_p]
+    return x11, extensions, system
+
+
+class SharedPicture:
+    """A picture that fills a window."""
+
+    def __init__(self, display: int, window: int, *, width_px: int, height_px: int) -> None:
+        """Create a black picture.
+
+        Args:
+            display: Pointer to an open Xlib `Display`.
+            window: The window's identifier. The window must have the screen's default visual.
+            width_px: The window's width.
+            height_px: The window's height.
+
+        Raises:
+            NotShared: Memory cannot be shared with the X server, or its pixels are not 32-bit BGRX.
+        """
+        self._display, self._window = display, window
+        self._segment = _Segment()
+        self._image: Any = None  # pointer to an XImage
+        self._context: int | None = None
+        self._attached = False
+        try:
+            self._open(width_px, height_px)
+        except BaseException:
+            self.close()
+            raise
+
+    def put(self) -> None:
+        """Ask the X server to copy the picture to its window. `finish` waits for it."""
+        size = self._image.contents.width, self._image.contents.height
+        _libraries()[1].XShmPutImage(self._display, self._window, self._context, self._image, 0, 0, 0, 0, *size, 0)
+
+    def close(self) -> None:
+        """Release the memory. May be called more than once. `pixels` must not be used afterwards."""
+        x11, extensions, system = _libraries()
+        if self._attached:
+            extensions.XShmDetach(self._display, byref(self._segment))
+            x11.XSync(self._display, 0)
+        if self._context:
+            x11.XFreeGC(self._display, self._context)
+        if self._image:
+            x11.XFree(self._image)
+        if self._segment.address:
+            system.shmdt(self._segment.address)
+        self._segment, self._image, self._context = _Segment(), None, None
+        self._attached = False
+
+    def _open(self, width_px: int, height_px: int) -> None:
+        x11, extensions, system = _libraries()
+        if not extensions.XShmQueryExtension(self._display):
+            raise NotShared("the X server has no MIT-SHM extension")
+        screen = x11.XDefaultScreen(self._display)
+        visual = x11.XDefaultVisual(self._display, screen)
+        self._image = extensions.XShmCreateImage(
+            self._display, visual, x11.XDefaultDepth(self._display, screen), Z_PIXMAP, None, byref(self._segment),
+            width_px, height_px,
+        )  # fmt: skip
+        if not self._image:
+            raise NotShared("the X server cannot create a shared picture")
+        image = self._image.contents
+        masks = visual.contents.red_mask, visual.contents.green_mask, visual.contents.blue_mask
+        if image.pixel_bits != 32 or image.stride != 4 * width_px or masks != (0xFF0000, 0xFF00, 0xFF):
+            raise NotShared("the X server's pixels are not 32-bit BGRX")
+        self._segment.id = system.shmget(PRIVATE, image.stride * height_px, CREATE | OWNER_ONLY)
+        if self._segment.id < 0:
+            raise NotShared(f"no shared memory: {os.strerror(ctypes.get_errno())}")
+        address = system.shmat(self._segment.id, None, 0)
+        if address in (None, c_void_p(-1).value):
+            system.shmctl(self._segment.id, REMOVE, None)
+            raise NotShared(f"no shared memory: {os.strerror(ctypes.get_errno())}")
+        self._segment.address = image.data = address
+        refused = xlib.refusals()
+        self._attached = bool(extensions.XShmAttach(self._display, byref(self._segment)))
+        x11.XSync(self._display, 0)
+        system.shmctl(self._segment.id, REMOVE, None)  # takes effect once the server and this process have let go
+        if not self._attached or xlib.refusals() != refused:
+            self._attached = False
+            raise NotShared("the X server cannot reach this process's memory")
+        self._context = x11.XCreateGC(self._display, self._window, 0, None)
+        if self._pixel_read_back(x11, extensions) != ctypes.c_uint32.from_address(address).value:
+            raise NotShared("the X server cannot reach this process's memory")
+        content = (ctypes.c_uint8 * (image.stride * height_px)).from_address(address)
+        self.pixels: U8 = np.frombuffer(content, np.uint8).reshape(height_px, width_px, 4)  # BGRX
+        self.pixels[:] = 0
+
+    def _pixel_read_back(self, x11: ctypes.CDLL, extensions: ctypes.CDLL) -> int | None:
+        """Return the value that the X server finds in the first pixel, after setting it to a random value.
+
+        A server in another IPC namespace may have attached a different segment, which has the same number there.
+        """
+        depth = self._image.contents.depth
+        ctypes.c_uint32.from_address(self._segment.address).value = int.from_bytes(os.urandom(3), "little")
+        pixmap = x11.XCreatePixmap(self._display, self._window, 1, 1, depth)
+        extensions.XShmPutImage(self._display, pixmap, self._context, self._image, 0, 0, 0, 0, 1, 1, 0)
+        copy = x11.XGetImage(self._display, pixmap, 0, 0, 1, 1, ALL_PLANES, Z_PIXMAP)
+        x11.XFreePixmap(self._display, pixmap)
+        if not copy:
+            return None
+        pixel = ctypes.c_uint32.from_address(copy.contents.data).value & 0xFFFFFF
+        x11.XDestroyImage(copy)
+        return int(pixel)
+
+
+def finish(display: int) -> None:
+    """Wait until the X server has carried out every request.
+
+    Args:
+        display: Pointer to an open Xlib `Display`.
+    """
+    _libraries()[0].XSync(display, 0)
+
+
+def flush(display: int) -> None:
+    """Send all requests to the X server without waiting for them.
+
+    Args:
+        display: Pointer to an open Xlib `Display`.
+    """
+    _libraries()[0].XFlush(display)
