@@ -99,7 +99,7 @@ class ScaleShift(ctypes.Structure):
 
 
 class ShownPanel(ctypes.Structure):
-    """One panel's picture to draw: where it is sampled, what is mixed in and where it goes. `Shown` in C++."""
+    """Arguments for drawing one panel's picture. Called `Shown` in C++."""
 
     _fields_ = (
         ("source", _pointer), ("source_stride", _long), ("screen", _pointer), ("screen_stride", _long),

@@ -23,7 +23,7 @@ from runtime.support.gl import draws_in_software
 log = logging.getLogger("phasestack.panels")
 
 
-class ContextLost(PanelLost):
+class WindowContextLost(PanelLost):
     """An OpenGL context failed and must be replaced."""
 
 
@@ -45,7 +45,7 @@ class PanelWindows(ABC):
         """Draw a frame for all panels, without showing it.
 
         Raises:
-            ContextLost: An OpenGL context failed.
+            WindowContextLost: An OpenGL context failed.
         """
 
     @abstractmethod
@@ -115,7 +115,7 @@ class ShaderWindows(PanelWindows):
             painter.draw(self._textures, frame, panel)
             context.finish()
             if fault := _reset_status() or _error(context):
-                raise ContextLost(f"the OpenGL context of panel {panel} failed: {fault}")
+                raise WindowContextLost(f"the OpenGL context of panel {panel} failed: {fault}")
 
     def show(self, clock: Clock) -> tuple[int, int]:
         swapped_ns = []
@@ -137,7 +137,10 @@ class ShaderWindows(PanelWindows):
 
 
 class ProcessorWindows(PanelWindows):
-    """Windows drawn by the processor, into memory shared with the X server. X does not report vertical blanks."""
+    """Windows drawn by the processor, into memory shared with the X server.
+
+    Frames appear while the monitors refresh, because X does not report vertical blanks.
+    """
 
     opengl = False
 

@@ -31,7 +31,7 @@ Array = TypeVar("Array", U8, F32)
 
 @dataclass(frozen=True, slots=True)
 class Mounting:
-    """How a panel's monitor is mounted: its pixels are the layer's, mirrored and turned by quarters."""
+    """Mounting of a panel whose monitor shows the layer's pixels, mirrored or turned by quarters."""
 
     rotation_deg: int
     mirror: str

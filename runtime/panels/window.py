@@ -14,7 +14,7 @@ from runtime.optics.stack import PanelStack
 from runtime.panels.base import PanelSink
 from runtime.panels.card import identity_card
 from runtime.panels.display import Display, connected_monitors, glfw
-from runtime.panels.drawing import ContextLost, PanelWindows, open_windows
+from runtime.panels.drawing import WindowContextLost, PanelWindows, open_windows
 from runtime.panels.monitors import Monitor, bind, check_modes, refresh_difference
 from runtime.panels.watch import PlacementWatch
 from runtime.records import U8, PanelFrame, PresentReport
@@ -115,7 +115,7 @@ class WindowPanels(PanelSink):
             return self._present(frame, unchanged)
         except (PanelLost, glfw.GLFWError, moderngl.Error) as error:
             self._lost = str(error)
-            self._context_lost = isinstance(error, ContextLost) or not isinstance(error, PanelLost)
+            self._context_lost = isinstance(error, WindowContextLost) or not isinstance(error, PanelLost)
             self._retreat()
             raise PanelLost(self._lost) from error
         finally:
