@@ -14,7 +14,7 @@ from runtime.optics.stack import PanelStack
 from runtime.panels.base import PanelSink
 from runtime.panels.card import identity_card
 from runtime.panels.display import Display, connected_monitors, glfw
-from runtime.panels.drawing import WindowContextLost, PanelWindows, open_windows
+from runtime.panels.drawing import PanelWindows, WindowContextLost, open_windows
 from runtime.panels.monitors import Monitor, bind, check_modes, refresh_difference
 from runtime.panels.watch import PlacementWatch
 from runtime.records import U8, PanelFrame, PresentReport
