@@ -1,10 +1,9 @@
 // Draw the panels' pictures on the processor (runtime/panels/processor.py): sample a layer, which may be coarse and
 // displaced by the content's relief, mix it with the flat picture and apply the panel's grey curve. Pixels have four
 // bytes. Positions in pictures count from the centre of the top left pixel, positions on the screen from its corner.
+#include <pthread.h>
 #include <sched.h>
 
-#include <system_error>
-#include <thread>
 #include <vector>
 
 #include "sampling.hpp"
@@ -183,28 +182,6 @@ INLINE void store(const Shown &shown, uint8_t *screen, int count, const Block &b
   }
 }
 
-struct Priority {
-  int policy = 0, level = 0;
-};
-
-#ifdef __linux__
-INLINE Priority priority_here() {
-  sched_param level{};
-  sched_getparam(0, &level);
-  return {std::max(sched_getscheduler(0), 0), level.sched_priority};
-}
-
-// Give this thread a priority that it would not inherit (SCHED_RESET_ON_FORK).
-INLINE void take(Priority priority) {
-  sched_param level{};
-  level.sched_priority = priority.level;
-  sched_setscheduler(0, priority.policy, &level);
-}
-#else
-INLINE Priority priority_here() { return {}; }
-INLINE void take(Priority) {}
-#endif
-
 }  // namespace
 
 FOR_EVERY_CPU void draw_rows(const Shown *given, int begin, int end) {
@@ -236,25 +213,54 @@ FOR_EVERY_CPU void draw_rows(const Shown *given, int begin, int end) {
   }
 }
 
+namespace {
+
+struct Part {
+  const Shown *shown;
+  int count, part, parts;
+};
+
+void *draw_part(void *given) {
+  const Part &part = *static_cast<const Part *>(given);
+  for (const Shown *shown = part.shown; shown < part.shown + part.count; ++shown)
+    draw_rows(shown, shown->rows * part.part / part.parts, shown->rows * (part.part + 1) / part.parts);
+  return nullptr;
+}
+
+// Start a thread with the caller's priority, which it would not inherit (SCHED_RESET_ON_FORK). If it got the priority
+// only later, it would often wait on the caller's core for the caller to finish.
+bool start(pthread_t &thread, Part &part) {
+  int policy = 0;
+  sched_param level{};
+  pthread_attr_t like_caller;
+  if (pthread_getschedparam(pthread_self(), &policy, &level) != 0 || pthread_attr_init(&like_caller) != 0) return false;
+#ifdef SCHED_RESET_ON_FORK
+  policy &= ~SCHED_RESET_ON_FORK;
+#endif
+  if (policy == SCHED_RR || policy == SCHED_FIFO) {
+    pthread_attr_setinheritsched(&like_caller, PTHREAD_EXPLICIT_SCHED);
+    pthread_attr_setschedpolicy(&like_caller, policy);
+    pthread_attr_setschedparam(&like_caller, &level);
+  }
+  const bool started = pthread_create(&thread, &like_caller, draw_part, &part) == 0;
+  pthread_attr_destroy(&like_caller);
+  return started;
+}
+
+}  // namespace
+
 // Draw pictures on several threads with the caller's priority. Each thread draws the same share of every picture's rows.
 extern "C" void draw_panels(const Shown *shown, int count, int threads) {
   const int parts = std::clamp(threads, 1, MAX_THREADS);
-  const auto draw = [=](int part) {
-    for (int n = 0; n < count; ++n)
-      draw_rows(shown + n, shown[n].rows * part / parts, shown[n].rows * (part + 1) / parts);
-  };
-  const Priority priority = priority_here();
-  std::thread others[MAX_THREADS];
-  for (int part = 1; part < parts; ++part) {
-    try {
-      others[part] = std::thread([=] { take(priority), draw(part); });
-    } catch (const std::system_error &) {
-      draw(part);
-    }
-  }
-  draw(0);
-  for (auto &other : others)
-    if (other.joinable()) other.join();
+  Part part[MAX_THREADS];
+  pthread_t thread[MAX_THREADS];
+  bool started[MAX_THREADS] = {};
+  for (int n = 0; n < parts; ++n) part[n] = {shown, count, n, parts};
+  for (int n = 1; n < parts; ++n) started[n] = start(thread[n], part[n]);
+  for (int n = 0; n < parts; ++n)
+    if (!started[n]) draw_part(&part[n]);
+  for (int n = 1; n < parts; ++n)
+    if (started[n]) pthread_join(thread[n], nullptr);
 }
 
 extern "C" { extern const int32_t shown_bytes = sizeof(Shown); }

@@ -7,9 +7,9 @@ pictures are the same to within rounding, because both follow `runtime.optics.al
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -20,22 +20,41 @@ from runtime.optics.alignment import scale_and_shift
 from runtime.optics.malus import rest_code
 from runtime.optics.relief import displacement
 from runtime.panels import lut
-from runtime.panels.geometry import layer_from_screen, panel_from_screen, permutes_pixels
+from runtime.panels.geometry import layer_from_screen, permutes_pixels
 from runtime.panels.presentation import shows_flat, shows_solved
-from runtime.records import F32, F64, U8, PanelFrame
+from runtime.records import F32, U8, PanelFrame
 
 MOST_THREADS = 4  # more threads would be limited by the memory
-IDENTITY = np.eye(3)
 Array = TypeVar("Array", U8, F32)
 
 
-@dataclass(frozen=True, slots=True)
-class Mounting:
+Line = tuple[float, float]  # scale and shift along an axis
+
+
+class Axis(NamedTuple):
+    """One axis of a monitor: layer pixel = sign · monitor pixel + offset_px, along the layer's axis `layer_axis`."""
+
+    layer_axis: int  # 0: to the right, 1: down
+    sign: int
+    offset_px: float
+
+    def turned(self, line: Line, size_px: tuple[int, int]) -> Line:
+        """Turn a map from layer pixels to a picture's pixels into one from monitor pixels to the turned picture's.
+
+        Args:
+            line: Scale and shift of the map along `layer_axis`.
+            size_px: The picture's width and height, as seen by the viewer.
+        """
+        scale, shift = line
+        edge = 0.0 if self.sign > 0 else float(size_px[self.layer_axis])
+        return scale, self.sign * (scale * self.offset_px + shift) + edge
+
+
+class Mounting(NamedTuple):
     """Mounting of a panel whose monitor shows the layer's pixels, mirrored or turned by quarters."""
 
-    rotation_deg: int
-    mirror: str
-    layer_from_screen: F64  # (3, 3) map from monitor pixels to layer pixels
+    across: Axis
+    down: Axis
 
     @classmethod
     def of(cls, settings: PanelSettings, *, screen_px: tuple[int, int], layer_px: tuple[int, int]) -> Mounting | None:
@@ -51,27 +70,20 @@ class Mounting:
             layer_width_px=layer_px[0], layer_height_px=layer_px[1],
             rotation_deg=settings.rotation_deg, mirror=settings.mirror, homography=settings.homography,
         )  # fmt: skip
-        return cls(settings.rotation_deg, settings.mirror, matrix / matrix[2, 2]) if permutes_pixels(matrix) else None
-
-    def screen_from_picture(self, size_px: tuple[int, int]) -> F64:
-        """Return the (3, 3) map from a picture's pixels, as seen by the viewer, to its pixels on the monitor.
-
-        Args:
-            size_px: The picture's width and height. It may be coarser than the panel.
-        """
-        width, height = size_px[::-1] if self.rotation_deg in (90, 270) else size_px
-        turn = panel_from_screen(
-            screen_width_px=width, screen_height_px=height, rotation_deg=self.rotation_deg, mirror=self.mirror
-        )
-        back = turn[:2, :2].T  # the inverse of quarter turns and mirrorings
-        return np.block([[back, -back @ turn[:2, 2:]], [np.array([[0.0, 0.0, 1.0]])]])
+        if not permutes_pixels(matrix):
+            return None
+        turn = matrix / matrix[2, 2]
+        axes = []
+        for column in (0, 1):
+            layer_axis = int(abs(turn[1, column]) > 0.5)
+            axes.append(Axis(layer_axis, round(turn[layer_axis, column]), float(turn[layer_axis, 2])))
+        return cls(*axes)
 
     def on_screen(self, picture: Array) -> Array:
         """Turn a picture, (h, w) or (h, w, 4), from how the viewer sees it to how the monitor shows it."""
-        matrix = self.screen_from_picture((picture.shape[1], picture.shape[0]))
-        if matrix[0, 0] == 0.0:
-            picture, matrix = np.swapaxes(picture, 0, 1), matrix[:, [1, 0, 2]]
-        return picture[:: int(matrix[1, 1]), :: int(matrix[0, 0])]
+        if self.across.layer_axis == 1:
+            picture = np.swapaxes(picture, 0, 1)
+        return picture[:: self.down.sign, :: self.across.sign]
 
 
 @dataclass(slots=True)
@@ -103,6 +115,7 @@ class ProcessorPainter:
         self._curves = [_fine_curve(panel) if panel.lut or panel.gamma != 1 else None for panel in panels]
         self._solved: _Pictures | None = None
         self._flat: _Pictures | None = None
+        self._memory: dict[object, tuple[U8, ...]] = {}  # pictures, reused for layers of the same size
         self._drawn: list[object] = [None] * len(screens)  # what each picture shows
         self._threads = min(len(os.sched_getaffinity(0)), MOST_THREADS)
 
@@ -146,22 +159,27 @@ class ProcessorPainter:
             border_px: Width of the border.
             extended: True to repeat the layers' edge pixels in the innermost pixel of the border.
         """
-        rest = min(rest_code(len(layers)), 255)
-        pictures: list[U8] = []
-        for layer, mounting in zip(layers, self._mountings, strict=True):
-            turned: U8 = np.ascontiguousarray(mounting.on_screen(layer))
-            if not border_px:
-                pictures.append(np.asarray(cv2.cvtColor(turned, cv2.COLOR_RGBA2BGRA), np.uint8))
-                continue
-            height, width = turned.shape[:2]
-            picture = np.full((height + 2 * border_px, width + 2 * border_px, 4), rest, np.uint8)
-            cv2.cvtColor(turned, cv2.COLOR_RGBA2BGRA, dst=picture[border_px:-border_px, border_px:-border_px])
+        turned = [np.ascontiguousarray(mounting.on_screen(layer)) for layer, mounting in self._pairs(layers)]
+        key = layers.shape, border_px
+        if key not in self._memory:
+            rest = min(rest_code(len(layers)), 255)
+            self._memory[key] = tuple(
+                np.pad(picture, ((border_px,) * 2, (border_px,) * 2, (0, 0)), constant_values=rest)
+                for picture in turned
+            )
+        pictures = self._memory[key]
+        for picture, layer in zip(pictures, turned, strict=True):
+            height, width = layer.shape[:2]
+            within = slice(border_px, border_px + height), slice(border_px, border_px + width)
+            cv2.cvtColor(layer, cv2.COLOR_RGBA2BGRA, dst=picture[within])
             if extended:
                 inner = picture[border_px - 1 : border_px + height + 1, border_px - 1 : border_px + width + 1]
                 inner[0, 1:-1], inner[-1, 1:-1] = inner[1, 1:-1], inner[-2, 1:-1]
                 inner[:, 0], inner[:, -1] = inner[:, 1], inner[:, -2]
-            pictures.append(picture)
-        return tuple(pictures)
+        return pictures
+
+    def _pairs(self, layers: U8) -> Iterator[tuple[U8, Mounting]]:
+        return zip(layers, self._mountings, strict=True)
 
     def _shown(
         self, panel: int, frame: PanelFrame, solved: _Pictures | None, flat: _Pictures | None
@@ -194,31 +212,32 @@ class ProcessorPainter:
         return (solved.version, *maps, flat.version, frame.flatness), shown
 
     def _maps(self, panel: int, frame: PanelFrame, solved: _Pictures) -> list[tuple[float, float, float, float]]:
-        """Return scales and shifts from a monitor's pixels: to positions in the source and, if the content's relief
-        displaces them, to positions in the relief and to the displacement by a relief of 1.
+        """Return scales and shifts (scale_u, scale_v, shift_u, shift_v) from a monitor's pixels.
 
-        Positions count from the centre of a picture's top left pixel.
-        """  # fmt: skip
-        mounting = self._mountings[panel]
+        The first leads to positions in the source. If the content's relief displaces them, two follow: to positions in
+        the relief, and to the displacement by a relief of 1. Positions count from the centre of a picture's top left
+        pixel.
+        """
         size_px = frame.size_px or solved.size_px
-        coarser = np.diag([solved.size_px[0] / size_px[0], solved.size_px[1] / size_px[1], 1.0])
-        aligned = frame.solved_from_shown[panel] if frame.solved_from_shown else IDENTITY
-        turned = mounting.screen_from_picture(solved.size_px)
-        source = turned @ coarser @ aligned @ mounting.layer_from_screen
-        source[:2, 2] += solved.border_px - 0.5
+        aligned = scale_and_shift(frame.solved_from_shown[panel]) if frame.solved_from_shown else (1.0, 1.0, 0.0, 0.0)
         moved = displacement(frame.relief, frame.parallax, panel)
-        if moved is None:
-            return [scale_and_shift(source)]
-        rows, columns = moved.relief.shape
-        middle = moved.middle_from_shown @ mounting.layer_from_screen
-        to_relief = np.diag([columns / size_px[0], rows / size_px[1], 1.0])
-        relief = mounting.screen_from_picture((columns, rows)) @ to_relief @ middle
-        relief[:2, 2] -= 0.5
-        push = IDENTITY.copy()
-        push[:2] = moved.growth * middle[:2]
-        push[:2, 2] += moved.drift_px
-        push[:2] = moved.weight * turned[:2, :2] @ coarser[:2, :2] @ push[:2]
-        return [scale_and_shift(matrix) for matrix in (source, relief, push)]
+        along: list[list[Line]] = [[], [], []]  # for each map, across and down; plain floats, because arrays are slow
+        for axis in self._mountings[panel]:
+            to = axis.layer_axis
+            coarser = solved.size_px[to] / size_px[to]
+            scale, shift = axis.turned((coarser * aligned[to], coarser * aligned[2 + to]), solved.size_px)
+            along[0].append((scale, shift + solved.border_px - 0.5))
+            if moved is None:
+                continue
+            middle = scale_and_shift(moved.middle_from_shown)
+            relief_px = moved.relief.shape[1], moved.relief.shape[0]
+            share = relief_px[to] / size_px[to]
+            scale, shift = axis.turned((share * middle[to], share * middle[2 + to]), relief_px)
+            along[1].append((scale, shift - 0.5))
+            by = moved.weight * coarser
+            at_edge = moved.drift_px[to] + moved.growth * (middle[to] * axis.offset_px + middle[2 + to])
+            along[2].append((by * moved.growth * middle[to], axis.sign * by * at_edge))
+        return [(across[0], down[0], across[1], down[1]) for across, down in filter(None, along)]
 
 
 def _fine_curve(settings: PanelSettings) -> U8:
