@@ -13,9 +13,11 @@ from runtime.records import FrameTiming
 PHASE_GAIN = 0.1  # share of the latest blank's prediction error used to correct the phase
 WORK_GAIN = 0.05  # gain for decreases of the estimated work time (0.5 for increases)
 LATE_SHARE = 0.5  # a refresh late by more than this share of a period is moved to the next slot
+HELD_GAIN = 0.01  # the same if drawn frames are held back until they are due, so that one in 50 is late
 MARGIN_GROWTH = 1.5  # the margin is multiplied by this after a missed blank
 MARGIN_DECAY = 0.9995  # and by this after a met blank: one blank in 800 is missed if MARGIN_MIN_NS is too low
 MARGIN_MIN_NS = NS_PER_MS
+MOST_WORK = 0.9  # maximum estimate of the work time, in periods
 
 
 class Pacer:
@@ -62,7 +64,15 @@ class Pacer:
         self._number += 1
         return FrameTiming(self._number, target_ns - lead_ns, target_ns, target_ns + self._photon_ns)
 
-    def presented(self, timing: FrameTiming, *, woke_ns: int, done_ns: int, blank_ns: int | None = None) -> int:
+    def presented(
+        self,
+        timing: FrameTiming,
+        *,
+        woke_ns: int,
+        done_ns: int,
+        blank_ns: int | None = None,
+        held_ns: int | None = None,
+    ) -> int:
         """Record what happened to a refresh, and return the best estimate of its display time.
 
         Args:
@@ -71,9 +81,10 @@ class Pacer:
             done_ns: When presenting was done.
             blank_ns: Time of the vertical blank at which the refresh appeared. None if the display driver does not
                 report blanks or skipped the swap.
+            held_ns: Time for which the drawn frame was held back until it was due. None if the output never does that.
         """
         if blank_ns is None:
-            self._learn_work(done_ns - woke_ns)
+            self._learn_work(done_ns - woke_ns - (held_ns or 0), fall=WORK_GAIN if held_ns is None else HELD_GAIN)
             # If blanks are known, the swap was skipped: the old picture stays on screen, and is on time in its slot.
             return (timing.present_ns if self._has_blanks else done_ns) + self._photon_ns
         self._has_blanks = True
@@ -93,8 +104,8 @@ class Pacer:
         """Return how much time to allow between waking and presenting, in nanoseconds."""
         return round(self._work_ns + (self._margin_ns if self._has_blanks else 0.0))
 
-    def _learn_work(self, work_ns: int) -> None:
+    def _learn_work(self, work_ns: int, *, fall: float) -> None:
         # The gain for increases is also below 1, so that one long refresh does not make later ones wake far too early.
-        gain = 0.5 if work_ns > self._work_ns else WORK_GAIN
-        bounded = min(work_ns, self.period_ns // 2)
+        gain = 0.5 if work_ns > self._work_ns else fall
+        bounded = min(work_ns, MOST_WORK * self.period_ns)
         self._work_ns += gain * (bounded - self._work_ns)

@@ -217,7 +217,7 @@ class Presenter:
         composed_ns, news = self.clock.now_ns(), self.solver.news()
         frame, limited = self._compose(timing, eyes, news)
         times.lap("track")
-        report, lost = self._present(frame)
+        report, lost = self._present(frame, due_ns=timing.present_ns)
         times.lap("present")
         if report is not None and times.simulated:  # the lap has advanced the clock by the cost of presenting it
             report = replace(report, present_ns=self.clock.now_ns())
@@ -303,8 +303,8 @@ class Presenter:
             self._aligned = last = solution.number, key, alignment
         return last[2]
 
-    def _present(self, frame: PanelFrame) -> tuple[PresentReport | None, str]:
-        """Present a frame.
+    def _present(self, frame: PanelFrame, *, due_ns: int) -> tuple[PresentReport | None, str]:
+        """Present a frame at `due_ns`, or as soon as possible after it.
 
         Returns:
             The report and "", or None and the reason if a panel is lost, or None and "" if there is no picture yet.
@@ -313,7 +313,7 @@ class Presenter:
             return None, ""
         unchanged = self.last is not None and self.last.account.presented and _same(frame, self.last.frame)
         try:
-            report = self.panels.present(frame, unchanged=unchanged)
+            report = self.panels.present(frame, unchanged=unchanged, due_ns=due_ns)
         except PanelLost as error:
             self.stats.fault("panel")
             return None, str(error)
@@ -324,7 +324,9 @@ class Presenter:
         """Tell the pacer what happened to a refresh, and return its display time."""
         if report is None:
             return self.pacer.presented(timing, woke_ns=woke_ns, done_ns=self.clock.now_ns())
-        return self.pacer.presented(timing, woke_ns=woke_ns, done_ns=report.present_ns, blank_ns=report.vblank_ns)
+        return self.pacer.presented(
+            timing, woke_ns=woke_ns, done_ns=report.present_ns, blank_ns=report.vblank_ns, held_ns=report.held_ns
+        )
 
     def _missing(self, news: SolverUpdate, lost: str) -> dict[str, str]:
         missing = dict(news.missing)

@@ -107,7 +107,7 @@ class ShownPanel(ctypes.Structure):
         ("source_rows", _int), ("source_columns", _int), ("rows", _int), ("columns", _int),
         ("relief_rows", _int), ("relief_columns", _int),
         ("source_from_screen", ScaleShift), ("relief_from_screen", ScaleShift), ("push", ScaleShift),
-        ("flatness", _float),
+        ("flatness", _float), ("every", _int),
     )  # fmt: skip
 
 

@@ -33,6 +33,9 @@ struct Shown {
   ScaleShift source_from_screen, relief_from_screen;
   ScaleShift push;  // displacement, in the source's pixels, by a relief of 1
   float flatness;   // weight of `flat`
+  // 1 to sample every pixel; 2 to sample every other pixel of every other row and average between them, which needs
+  // `flat` to be null.
+  int32_t every;
 };
 
 typedef uint16_t Pair __attribute__((may_alias));  // two of a pixel's bytes
@@ -182,34 +185,89 @@ INLINE void store(const Shown &shown, uint8_t *screen, int count, const Block &b
   }
 }
 
+INLINE void draw_row(const Shown &shown, int r, uint8_t *screen, Relief &kept, Block &block) {
+  const float *upper = nullptr, *lower = nullptr;
+  float share = 0;
+  if (shown.relief) {
+    const ScaleShift &at = shown.relief_from_screen;
+    const float v = std::clamp((float(r) + 0.5f) * at.scale_v + at.shift_v, 0.0f, float(shown.relief_rows - 1));
+    share = v - float(int(v));
+    upper = relief_row(shown, kept, int(v)), lower = relief_row(shown, kept, std::min(int(v) + 1, shown.relief_rows - 1));
+  }
+  for (int c = 0; c < shown.columns; c += BLOCK_PX) {
+    const int count = std::min(BLOCK_PX, shown.columns - c), n = c / BLOCK_PX;
+    const bool rises = upper && (kept.rises[0][n] || kept.rises[1][n]);
+    locate(shown, r, c, count, rises ? upper : nullptr, lower, share, block);
+    interpolate(shown, count, block);
+    if (shown.flat) {
+      const uint8_t *flat = shown.flat + r * shown.flat_stride + 4 * c;
+      mix_in(flat, int16_t(shown.flatness * (UNIT - 1) + 0.5f), count, block);
+    }
+    store(shown, screen + 4 * c, count, block);
+  }
+}
+
+// Return a map for a picture of every other pixel: its pixel (k, l) is the screen's pixel (2k, 2l).
+INLINE ScaleShift halved(const ScaleShift &map) {
+  return {2 * map.scale_u, 2 * map.scale_v, map.shift_u - 0.5f * map.scale_u, map.shift_v - 0.5f * map.scale_v};
+}
+
+INLINE Shown halved(const Shown &shown) {
+  Shown half = shown;
+  half.rows = shown.rows / 2 + 1, half.columns = shown.columns / 2 + 1;
+  half.source_from_screen = halved(shown.source_from_screen);
+  half.relief_from_screen = halved(shown.relief_from_screen);
+  half.push = halved(shown.push);
+  half.curve = nullptr;
+  return half;
+}
+
+INLINE uint32_t average(uint32_t a, uint32_t b) { return (a | b) - ((a ^ b) >> 1 & 0x7F7F7F7F); }  // of each byte
+
+INLINE void average(const uint32_t *a, const uint32_t *b, uint32_t *to, int count) {
+  VECTORISED for (int k = 0; k < count; ++k) to[k] = average(a[k], b[k]);
+}
+
+INLINE uint8_t *bytes_of(std::vector<uint32_t> &line) { return reinterpret_cast<uint8_t *>(line.data()); }
+
+// Draw a row from every other pixel, and apply the curve.
+INLINE void widen(const Shown &shown, const uint32_t *line, uint8_t *screen) {
+  auto *pixels = reinterpret_cast<Word *>(screen);
+  VECTORISED for (int k = 0; k < shown.columns / 2; ++k)
+    pixels[2 * k] = line[k], pixels[2 * k + 1] = average(line[k], line[k + 1]);
+  if (shown.columns % 2) pixels[shown.columns - 1] = line[shown.columns / 2];
+  if (!shown.curve) return;
+  constexpr int step = CURVE / 256;
+  for (int k = 0; k < 4 * shown.columns; k += 4)
+    for (int channel = 0; channel < 3; ++channel)
+      screen[k + channel] = shown.curve[channel * CURVE + screen[k + channel] * step];
+}
+
 }  // namespace
 
 FOR_EVERY_CPU void draw_rows(const Shown *given, int begin, int end) {
   const Shown shown = *given;
   Block block;
   Relief kept;
-  if (shown.relief) prepare(shown, kept);
+  if (shown.every == 1) {
+    if (shown.relief) prepare(shown, kept);
+    for (int r = begin; r < end; ++r)
+      if (!copied(shown, r)) draw_row(shown, r, shown.screen + r * shown.screen_stride, kept, block);
+    return;
+  }
+  const Shown half = halved(shown);
+  if (half.relief) prepare(half, kept);
+  std::vector<uint32_t> lines[2], between_lines(half.columns);
+  for (auto &line : lines) line.resize(half.columns);
+  draw_row(half, begin / 2, bytes_of(lines[begin / 2 & 1]), kept, block);
   for (int r = begin; r < end; ++r) {
-    if (copied(shown, r)) continue;
-    const float *upper = nullptr, *lower = nullptr;
-    float share = 0;
-    if (shown.relief) {
-      const ScaleShift &at = shown.relief_from_screen;
-      const float v = std::clamp((float(r) + 0.5f) * at.scale_v + at.shift_v, 0.0f, float(shown.relief_rows - 1));
-      share = v - float(int(v));
-      upper = relief_row(shown, kept, int(v)), lower = relief_row(shown, kept, std::min(int(v) + 1, shown.relief_rows - 1));
+    const uint32_t *line = lines[r / 2 & 1].data();
+    if (r % 2) {
+      draw_row(half, r / 2 + 1, bytes_of(lines[(r / 2 + 1) & 1]), kept, block);
+      average(line, lines[(r / 2 + 1) & 1].data(), between_lines.data(), half.columns);
+      line = between_lines.data();
     }
-    for (int c = 0; c < shown.columns; c += BLOCK_PX) {
-      const int count = std::min(BLOCK_PX, shown.columns - c), n = c / BLOCK_PX;
-      const bool rises = upper && (kept.rises[0][n] || kept.rises[1][n]);
-      locate(shown, r, c, count, rises ? upper : nullptr, lower, share, block);
-      interpolate(shown, count, block);
-      if (shown.flat) {
-        const uint8_t *flat = shown.flat + r * shown.flat_stride + 4 * c;
-        mix_in(flat, int16_t(shown.flatness * (UNIT - 1) + 0.5f), count, block);
-      }
-      store(shown, shown.screen + r * shown.screen_stride + 4 * c, count, block);
-    }
+    widen(shown, line, shown.screen + r * shown.screen_stride);
   }
 }
 

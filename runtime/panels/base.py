@@ -25,7 +25,7 @@ class PanelSink(ABC):
         return []
 
     @abstractmethod
-    def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
+    def present(self, frame: PanelFrame, *, unchanged: bool = False, due_ns: int | None = None) -> PresentReport:
         """Show a frame on every panel.
 
         The output aligns the solution and then mixes it with the flat picture. The caller must not change the frame's
@@ -36,6 +36,8 @@ class PanelSink(ABC):
             unchanged: True if the frame is certain to show the same picture as the previous one. A panel that is
                 already showing this picture then skips the update, so displaying the flat picture with no viewer
                 present costs almost nothing.
+            due_ns: When the panels should show the frame, on the run's clock. An output without vertical blanks waits
+                until then if it has drawn the frame earlier.
 
         Raises:
             PanelLost: A panel can no longer show frames. Later calls try to reopen the panels.

@@ -24,6 +24,9 @@ from runtime.panels.geometry import layer_from_screen, permutes_pixels
 from runtime.panels.presentation import shows_flat, shows_solved
 from runtime.records import F32, U8, PanelFrame
 
+COARSE = (
+    2.5  # a solution coarser by this is sampled at every other pixel; it costs at most 0.2 dB (docs/mathematics.md)
+)
 MOST_THREADS = 4  # more threads would be limited by the memory
 Array = TypeVar("Array", U8, F32)
 
@@ -187,7 +190,11 @@ class ProcessorPainter:
         """Return what a panel shows, for comparison, and the arguments that draw it."""
         screen, curve = self._screens[panel], self._curves[panel]
         shown = ShownPanel(
-            screen=screen.ctypes.data, screen_stride=screen.strides[0], rows=screen.shape[0], columns=screen.shape[1]
+            screen=screen.ctypes.data,
+            screen_stride=screen.strides[0],
+            rows=screen.shape[0],
+            columns=screen.shape[1],
+            every=1,
         )
         if curve is not None:
             shown.curve = curve.ctypes.data
@@ -206,6 +213,8 @@ class ProcessorPainter:
             shown.relief, (shown.relief_rows, shown.relief_columns) = relief.ctypes.data, relief.shape
             shown.relief_from_screen, shown.push = ScaleShift(*maps[1]), ScaleShift(*maps[2])
         if flat is None:
+            if (frame.size_px or solved.size_px)[0] >= COARSE * solved.size_px[0]:
+                shown.every = 2
             return (solved.version, *maps), shown
         other = flat.pictures[panel]
         shown.flat, shown.flat_stride, shown.flatness = other.ctypes.data, other.strides[0], frame.flatness

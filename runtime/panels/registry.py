@@ -23,7 +23,7 @@ class OffscreenPanels(PanelSink):
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
 
-    def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
+    def present(self, frame: PanelFrame, *, unchanged: bool = False, due_ns: int | None = None) -> PresentReport:
         return PresentReport(frame.number, self._clock.now_ns(), 0.0)
 
     def close(self) -> None:
@@ -38,7 +38,7 @@ class BrowserPanels(PanelSink):
     def __init__(self, link: BrowserLink, clock: Clock) -> None:
         self._link, self._clock = link, clock
 
-    def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
+    def present(self, frame: PanelFrame, *, unchanged: bool = False, due_ns: int | None = None) -> PresentReport:
         self._link.frame = frame
         return PresentReport(frame.number, self._clock.now_ns(), 0.0)
 

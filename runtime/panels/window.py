@@ -100,7 +100,7 @@ class WindowPanels(PanelSink):
     def window_handles(self) -> list[Any]:
         return [window.handle for window in self._windows.windows] if self._windows is not None else []
 
-    def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
+    def present(self, frame: PanelFrame, *, unchanged: bool = False, due_ns: int | None = None) -> PresentReport:
         """Show a frame on all panels, unless it is unchanged and still on them.
 
         Raises:
@@ -112,7 +112,7 @@ class WindowPanels(PanelSink):
             if self._windows is None:
                 self._open()
                 log.info("panels are working again: %s", ", ".join(str(monitor) for monitor in self.monitors))
-            return self._present(frame, unchanged)
+            return self._present(frame, unchanged, due_ns)
         except (PanelLost, glfw.GLFWError, moderngl.Error) as error:
             self._lost = str(error)
             self._context_lost = isinstance(error, WindowContextLost) or not isinstance(error, PanelLost)
@@ -126,7 +126,7 @@ class WindowPanels(PanelSink):
         self._drop()
         self._give_back()
 
-    def _present(self, frame: PanelFrame, unchanged: bool) -> PresentReport:
+    def _present(self, frame: PanelFrame, unchanged: bool, due_ns: int | None) -> PresentReport:
         display, windows, watch = self._display, self._windows, self._watch
         assert display is not None and windows is not None and watch is not None
         if fault := display.poll() or watch.look():
@@ -135,11 +135,16 @@ class WindowPanels(PanelSink):
             return PresentReport(frame.number, self._clock.now_ns(), 0.0)
         self._away = windows.opengl
         windows.draw(frame)
+        held_ns = None
+        if due_ns is not None and not windows.opengl:
+            drawn_ns = self._clock.now_ns()
+            self._clock.sleep_until_ns(due_ns - windows.show_ns)
+            held_ns = self._clock.now_ns() - drawn_ns
         first_ns, last_ns = windows.show(self._clock)
         self._shown = True
         blank_ns = first_ns if windows.opengl else None
         skew_ms = (last_ns - first_ns) / NS_PER_MS
-        return PresentReport(frame.number, last_ns, skew_ms, vblank_ns=blank_ns)
+        return PresentReport(frame.number, last_ns, skew_ms, vblank_ns=blank_ns, held_ns=held_ns)
 
     def _may_try(self) -> bool:
         """Return True if the delay before reopening is over or the connected monitors have changed."""

@@ -209,11 +209,11 @@ class BreakablePanels:
         self._panels, self.lost, self.name = panels, "", panels.name
         self.shown: list[PanelFrame] = []
 
-    def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
+    def present(self, frame: PanelFrame, *, unchanged: bool = False, due_ns: int | None = None) -> PresentReport:
         if self.lost:
             raise PanelLost(self.lost)
         self.shown.append(frame)
-        return self._panels.present(frame, unchanged=unchanged)
+        return self._panels.present(frame, unchanged=unchanged, due_ns=due_ns)
 
     def close(self) -> None:
         self._panels.close()

@@ -119,7 +119,7 @@ class FakePanels(PanelSink):
         self._clock, self.lost = clock, ""
         self.shown: list[tuple[PanelFrame, bool]] = []  # and whether it was vouched to be unchanged
 
-    def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
+    def present(self, frame: PanelFrame, *, unchanged: bool = False, due_ns: int | None = None) -> PresentReport:
         if self.lost:
             raise PanelLost(self.lost)
         self.shown.append((frame, unchanged))

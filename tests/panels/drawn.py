@@ -29,7 +29,7 @@ class DrawnPanels(OffscreenPanels):
             self._painters.append(Painter(context, settings, screen_px=screen, layer_px=size_px))
             self._targets.append(context.framebuffer([context.texture(screen, 4)]))
 
-    def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
+    def present(self, frame: PanelFrame, *, unchanged: bool = False, due_ns: int | None = None) -> PresentReport:
         self._frame = frame
         return super().present(frame, unchanged=unchanged)
 
@@ -75,7 +75,7 @@ class ProcessorDrawnPanels(OffscreenPanels):
             self._screens.append(np.zeros((*screen[::-1], 4), np.uint8))
         self._painter = ProcessorPainter(panels, mountings, self._screens)
 
-    def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
+    def present(self, frame: PanelFrame, *, unchanged: bool = False, due_ns: int | None = None) -> PresentReport:
         self._frame = frame
         return super().present(frame, unchanged=unchanged)
 

@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -184,6 +185,15 @@ def test_a_picture_that_another_window_covered_is_shown_again(x: XServer, opened
         return bool(np.array_equal(x.panel(2), picture(0, 0)[..., :3]))
 
     assert eventually(shown_again)
+
+
+@PROCESSOR
+def test_a_frame_drawn_early_is_shown_when_it_is_due(opened: Callable[..., Any]) -> None:
+    sink = opened(*BY_CONNECTOR)
+    due_ns = time.monotonic_ns() + 200_000_000
+    report = sink.present(frame(0), due_ns=due_ns)
+    assert report.present_ns >= due_ns and report.held_ns > 0
+    assert sink.present(frame(1), due_ns=due_ns).held_ns < 100_000_000  # it is late
 
 
 @PROCESSOR
