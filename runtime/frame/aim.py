@@ -177,14 +177,14 @@ class Aim:
     def _horizon_s(self, timing: FrameTiming, *, speed_m_s: float) -> float:
         """Return how long the head is expected to keep moving as it does now, in seconds.
 
-        A calm head is expected to stay calm for as long as it has already been calm.
+        A calm head is expected to stay calm for as long as it has already been calm, and for `HORIZON_S` more.
         """
         if speed_m_s > CALM_M_S:
             self._calm_ns = None
             return HORIZON_S
         if self._calm_ns is None:
             self._calm_ns = timing.photon_ns
-        return max(HORIZON_S, (timing.photon_ns - self._calm_ns) / NS_PER_S)
+        return HORIZON_S + (timing.photon_ns - self._calm_ns) / NS_PER_S
 
     def _usual_speed_m_s(self, moved_m: float, eyes: EyesEstimate) -> float:
         """Return the head's current speed or the RMS of its recent speed, whichever is larger.

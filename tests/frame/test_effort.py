@@ -13,6 +13,7 @@ from runtime.frame.effort import (
     BLUR_M,
     FIRST_DETAIL,
     KEPT_SOLUTIONS,
+    RASTER_SHARES,
     REST,
     CostBook,
     Costs,
@@ -113,6 +114,16 @@ def test_a_residual_counts_for_the_steps_that_it_had() -> None:
     pictures.learn(Measures(residual=1e-3), Effort(1, 2))
     assert pictures.own(Effort(1, 2)) == pytest.approx(1e-3)
     assert pictures.own(Effort(1, 0)) > pictures.own(Effort(1, 4))
+
+
+def test_a_coarse_solutions_residual_tells_little_of_the_full_rasters() -> None:
+    """The first solution is coarse; its residual would make steps on a coarse raster seem better than a finer one."""
+    pictures = PictureStatistics()
+    pictures.learn(Measures(residual=3e-3), Effort(4, 0))
+    assert pictures.own(Effort(4, 0)) == pytest.approx(pictures.detail[4] + 3e-3)
+    assert pictures.own(Effort(1, 0)) < pictures.own(Effort(2, 2)) - pictures.detail[2]
+    assert tuple(RASTER_SHARES) == REDUCTIONS
+    assert list(RASTER_SHARES.values()) == sorted(RASTER_SHARES.values())
 
 
 def test_displacements_are_scaled_to_those_that_come_to_pass() -> None:

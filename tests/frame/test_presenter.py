@@ -395,6 +395,19 @@ def test_a_solver_that_has_not_started_yet_stops_no_refresh(stage: Stage) -> Non
     assert stage.presenter.stats.frames == before + 30
 
 
+def test_a_calm_head_gets_longer_solutions_within_a_second() -> None:
+    """The longer a head has been calm, the less it matters that panels cannot answer while a solution is computed."""
+    stage, model = Stage(), Named("model of four rasters")
+    model.reductions = stage.solver.reductions = (1, 2, 3, 4)
+    stage.solver.solve_cost_ns = 600 * NS_PER_MS
+    stage.cell.replace(predictor=model)
+    stage.eyes = lambda time_s: aside(0.002 * np.sin(2 * time_s))
+    stage.refresh(HZ)
+    asked = [request.effort.reduction for request in stage.solver.requests]
+    assert asked[HZ // 3] > 2
+    assert asked[-1] == 2
+
+
 def test_a_moving_head_about_to_be_given_up_gets_no_long_solution(stage: Stage) -> None:
     """Otherwise the solver is busy when the head comes back."""
     model = Named("model of four rasters")
