@@ -241,11 +241,11 @@ def test_the_watchdog_outlives_a_hung_solver_but_not_an_endless_refresh(fed: Rig
     panels, spoken = fed.break_panels(), []
     present = panels.present
 
-    def slow(frame: Any, *, unchanged: bool = False) -> Any:
+    def slow(frame: Any, *, unchanged: bool = False, due_ns: int | None = None) -> Any:
         heard.heard()
         time.sleep(WATCHDOG_S * 1.5)
         spoken.extend(heard.heard())
-        return present(frame, unchanged=unchanged)
+        return present(frame, unchanged=unchanged, due_ns=due_ns)
 
     panels.present = slow  # type: ignore[method-assign]
     fed.refreshes(1)

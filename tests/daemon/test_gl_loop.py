@@ -85,13 +85,14 @@ def test_panels_show_opengl_s_solution_and_a_returning_monitor_keeps_the_solver(
 def test_contexts_lost_by_the_panels_are_remade_with_the_solver_without_leaks(
     server: xserver.XServer, monkeypatch: pytest.MonkeyPatch, losses: int
 ) -> None:
+    monkeypatch.setattr("runtime.panels.drawing.draws_in_software", lambda context: False)  # as if there were a GPU
     with Rig(**ON_WINDOWS, abandon_s=0.2) as rig:
         rig.refresh_until_solved()
         connected, held = connection(), {}
         for loss in range(losses):
             parts, lost = rig.run.parts, rig.presenter.panels.contexts_lost
             with monkeypatch.context() as reset:
-                reset.setattr("runtime.panels.window._reset_status", lambda: "the driver reset the GPU (0x8253)")
+                reset.setattr("runtime.panels.drawing._reset_status", lambda: "the driver reset the GPU (0x8253)")
                 rig.refresh_until(lambda: "panel" in rig.presenter.missing)
             assert rig.presenter.panels.contexts_lost == lost + 1
             rig.refresh_until(lambda before=parts: rig.run.parts is not before and not rig.presenter.missing)

@@ -359,9 +359,9 @@ def test_panels_that_take_longer_than_a_period_are_told_by_the_presenter() -> No
     stage.solver.hand_over(solved=solution(1))
     present = stage.panels.present
 
-    def slow(frame: Any, *, unchanged: bool = False) -> Any:
+    def slow(frame: Any, *, unchanged: bool = False, due_ns: int | None = None) -> Any:
         stage.clock.advance_ns(round(1.6 * PERIOD_NS))
-        return present(frame, unchanged=unchanged)
+        return present(frame, unchanged=unchanged, due_ns=due_ns)
 
     stage.refresh(150)
     assert "late" not in stage.presenter.machine.reason
