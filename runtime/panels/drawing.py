@@ -260,23 +260,36 @@ def open_windows(
         PanelLost: A monitor is no longer connected, or the X server does not support OpenGL.
     """
     root = display.root  # must be the first window
-    if on_processor is None:
-        on_processor = draws_in_software(root.gl)
-    if on_processor:
-        found = [
-            Mounting.of(panel, screen_px=monitor.size_px, layer_px=layer_px)
-            for panel, monitor in zip(panels, monitors, strict=True)
-        ]
-        mountings = [mounting for mounting in found if mounting is not None]
-        if len(mountings) == len(panels):
-            try:
-                return ProcessorWindows(display, panels, monitors, mountings, clock)
-            except NotShared as error:
-                log.warning("there is no GPU, and %s: drawing will be slow", error)
-                display.close_windows()
-        else:
-            log.warning("there is no GPU, and a panel's homography needs OpenGL: drawing will be slow")
+    if draws_in_software(root.gl) if on_processor is None else on_processor:
+        windows = _processor_windows(display, panels, monitors, layer_px, clock)
+        if windows is not None:
+            return windows
     return ShaderWindows(display, panels, monitors, layer_px)
+
+
+def _processor_windows(
+    display: Display,
+    panels: Sequence[PanelSettings],
+    monitors: Sequence[Monitor],
+    layer_px: tuple[int, int],
+    clock: Clock,
+) -> ProcessorWindows | None:
+    """Open windows drawn by the processor, or return None and log why that is impossible."""
+    mountings = []
+    for number, (panel, monitor) in enumerate(zip(panels, monitors, strict=True)):
+        mounting = Mounting.of(panel, screen_px=monitor.size_px, layer_px=layer_px)
+        if mounting is None:
+            log.warning("there is no GPU, and panel %d's homography needs OpenGL: drawing will be slow", number)
+            return None
+        mountings.append(mounting)
+    try:
+        windows = ProcessorWindows(display, panels, monitors, mountings, clock)
+    except NotShared as error:
+        log.warning("there is no GPU, and %s: drawing will be slow", error)
+        display.close_windows()
+        return None
+    log.info("there is no GPU: the panels are drawn on the processor")
+    return windows
 
 
 def _error(context: moderngl.Context) -> str:

@@ -201,7 +201,7 @@ def test_a_registered_panel_is_drawn_by_opengl(opened: Callable[..., Any], caplo
     bent = ((1.0, 0.01, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     sink = opened(PanelSettings(connector="DUMMY2", homography=bent), *BY_CONNECTOR[1:])
     assert presents(sink, 0)
-    assert "a panel's homography needs OpenGL" in caplog.text
+    assert "panel 0's homography needs OpenGL" in caplog.text
 
 
 @pytest.mark.skipif(os.getuid() != 0 or shutil.which("unshare") is None, reason="needs root and unshare")
