@@ -240,7 +240,7 @@ def step_share(steps: int) -> float:
 
 
 def residual_share(effort: Effort) -> float:
-    """Return a solution's squared error, without lost detail, relative to the full raster's without any steps."""
+    """Return the solver's squared error, relative to that on the full raster without any steps."""
     return RASTER_SHARES.get(effort.reduction, 1.0) * step_share(effort.steps)
 
 

@@ -35,14 +35,14 @@ Line = tuple[float, float]  # scale and shift along an axis
 
 
 class Axis(NamedTuple):
-    """One axis of a monitor: layer pixel = sign · monitor pixel + offset_px, along the layer's axis `layer_axis`."""
+    """A monitor's axis, where layer pixel = sign · monitor pixel + offset_px along `layer_axis`."""
 
     layer_axis: int  # 0: to the right, 1: down
     sign: int
     offset_px: float
 
     def turned(self, line: Line, size_px: tuple[int, int]) -> Line:
-        """Turn a map from layer pixels to a picture's pixels into one from monitor pixels to the turned picture's.
+        """Turn a map from layer to picture pixels into one from monitor pixels to the turned picture's.
 
         Args:
             line: Scale and shift of the map along `layer_axis`.
