@@ -34,8 +34,7 @@ GAIN = 0.2  # weight given to the latest measurement in a running mean
 KEPT_SOLUTIONS = 100  # a raster's times are discarded after this many solutions on other rasters
 # Squared light error without any steps by reduction, relative to the full raster, and after k steps, relative to none:
 # `balanced` solver, means over the demo, texture and moving scenes at 960x540, with a still and a leaning head and with
-# tracking errors of 0.3 and 3 mm, as measured by `SolutionMeter`. Steps after the fourth only help eyes that are off by
-# 2 mm.
+# tracking errors of 0.3 and 3 mm, as measured by `SolutionMeter`. Steps after the fourth hardly matter.
 RASTER_SHARES = {1: 1.0, 2: 2.1, 3: 2.5, 4: 3.5}
 STEP_SHARES = (1.0, 0.68, 0.53, 0.36, 0.34, 0.34, 0.33, 0.33, 0.33)
 FIRST_RESIDUAL = 1e-3  # initial estimate of the squared error on the full raster without any steps

@@ -12,12 +12,13 @@ from runtime.records import FrameTiming
 
 PHASE_GAIN = 0.1  # share of the latest blank's prediction error used to correct the phase
 WORK_GAIN = 0.05  # gain for decreases of the estimated work time (0.5 for increases)
+HELD_GAIN = 0.01  # the same if drawn frames are held back until they are due, so that few are late
 LATE_SHARE = 0.5  # a refresh late by more than this share of a period is moved to the next slot
-HELD_GAIN = 0.01  # the same if drawn frames are held back until they are due, so that one in 50 is late
 MARGIN_GROWTH = 1.5  # the margin is multiplied by this after a missed blank
 MARGIN_DECAY = 0.9995  # and by this after a met blank: one blank in 800 is missed if MARGIN_MIN_NS is too low
 MARGIN_MIN_NS = NS_PER_MS
-MOST_WORK = 0.9  # maximum estimate of the work time, in periods
+MOST_WORK = 0.5  # maximum estimate of the work time, in periods
+MOST_HELD_WORK = 0.9  # the same if drawn frames are held back until they are due
 
 
 class Pacer:
@@ -44,6 +45,7 @@ class Pacer:
         self._work_ns = float(work_ns)
         self._margin_ns = float(MARGIN_MIN_NS)
         self._has_blanks = False
+        self._holds = False  # True if the output holds drawn frames back
         self._target_ns: int | None = None  # planned present time of the latest refresh
         self._number = -1
         self.missed = 0
@@ -83,8 +85,15 @@ class Pacer:
                 report blanks or skipped the swap.
             held_ns: Time for which the drawn frame was held back until it was due. None if the output never does that.
         """
+        self._holds = held_ns is not None or (self._holds and blank_ns is None)
+        if held_ns is not None:
+            self._has_blanks = False
+            self._learn_work(done_ns - woke_ns - held_ns, fall=HELD_GAIN, most=MOST_HELD_WORK)
+            return done_ns + self._photon_ns
+        if blank_ns is None and self._holds:  # nothing was drawn
+            return timing.present_ns + self._photon_ns
         if blank_ns is None:
-            self._learn_work(done_ns - woke_ns - (held_ns or 0), fall=WORK_GAIN if held_ns is None else HELD_GAIN)
+            self._learn_work(done_ns - woke_ns, fall=WORK_GAIN, most=MOST_WORK)
             # If blanks are known, the swap was skipped: the old picture stays on screen, and is on time in its slot.
             return (timing.present_ns if self._has_blanks else done_ns) + self._photon_ns
         self._has_blanks = True
@@ -104,8 +113,8 @@ class Pacer:
         """Return how much time to allow between waking and presenting, in nanoseconds."""
         return round(self._work_ns + (self._margin_ns if self._has_blanks else 0.0))
 
-    def _learn_work(self, work_ns: int, *, fall: float) -> None:
+    def _learn_work(self, work_ns: int, *, fall: float, most: float) -> None:
         # The gain for increases is also below 1, so that one long refresh does not make later ones wake far too early.
         gain = 0.5 if work_ns > self._work_ns else fall
-        bounded = min(work_ns, MOST_WORK * self.period_ns)
+        bounded = min(work_ns, most * self.period_ns)
         self._work_ns += gain * (bounded - self._work_ns)

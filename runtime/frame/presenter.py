@@ -1,7 +1,8 @@
 """Present the latest solution at every refresh, aligned to the eyes at the display time.
 
 At each refresh, the presenter takes in the samples that have arrived, predicts the eyes at the display time, aligns the
-latest solution to them, presents it and records the result. The loop only ever waits for the next refresh's time slot.
+latest solution to them, presents it and records the result. The loop only ever waits for a refresh's time slot and, on
+outputs without vertical blanks, for the time when its frame is due.
 The solver (`solver_host`) runs in parallel and delivers complete solutions.
 """
 
@@ -113,6 +114,11 @@ class RefreshTimes:
                 self._simulated.advance_ns(round(cost_ms * NS_PER_MS))
             self.stage_ms[stage] = cost_ms
 
+    def hold(self, held_ns: int) -> None:
+        """Count a part of the stage `present` as `wait`, because the drawn frame was held back."""
+        self.stage_ms["present"] -= held_ns / NS_PER_MS
+        self.stage_ms["wait"] = self.stage_ms.get("wait", 0.0) + held_ns / NS_PER_MS
+
     def overhead_ms(self) -> float:
         """Return how long the refresh has taken on the machine's clock, in milliseconds.
 
@@ -217,8 +223,10 @@ class Presenter:
         composed_ns, news = self.clock.now_ns(), self.solver.news()
         frame, limited = self._compose(timing, eyes, news)
         times.lap("track")
-        report, lost = self._present(frame, due_ns=timing.present_ns)
+        report, lost = self._present(frame, due_ns=None if times.simulated else timing.present_ns)
         times.lap("present")
+        if report is not None and report.held_ns:
+            times.hold(report.held_ns)
         if report is not None and times.simulated:  # the lap has advanced the clock by the cost of presenting it
             report = replace(report, present_ns=self.clock.now_ns())
         photon_ns = self._presented_at(timing, report, woke_ns=woke_ns)
@@ -303,8 +311,8 @@ class Presenter:
             self._aligned = last = solution.number, key, alignment
         return last[2]
 
-    def _present(self, frame: PanelFrame, *, due_ns: int) -> tuple[PresentReport | None, str]:
-        """Present a frame at `due_ns`, or as soon as possible after it.
+    def _present(self, frame: PanelFrame, *, due_ns: int | None) -> tuple[PresentReport | None, str]:
+        """Present a frame at `due_ns` or, if that has passed or is None, at once.
 
         Returns:
             The report and "", or None and the reason if a panel is lost, or None and "" if there is no picture yet.

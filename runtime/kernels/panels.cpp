@@ -58,7 +58,7 @@ INLINE uint16_t pair_of(int16_t even, int16_t odd) {
 INLINE int16_t between(int16_t a, int16_t b, int16_t weight) { return int16_t(a + product(int16_t(b - a), weight)); }
 
 // Return a position in fixed point, moved into a picture of `count` pixels so that a further pixel follows it. The lower
-// 15 bits are the weight of that pixel. A position that is not a number becomes 0.
+// 15 bits are the weight of that pixel.
 INLINE int32_t fixed(float position, int count) {
   const int32_t at = int32_t(std::min(std::max(position, 0.0f), float(count - 1)) * UNIT);
   return std::max(std::min(at, (count - 1) * UNIT - 1), 0);
@@ -291,16 +291,18 @@ bool start(pthread_t &thread, Part &part) {
   int policy = 0;
   sched_param level{};
   pthread_attr_t like_caller;
-  if (pthread_getschedparam(pthread_self(), &policy, &level) != 0 || pthread_attr_init(&like_caller) != 0) return false;
-#ifdef SCHED_RESET_ON_FORK
-  policy &= ~SCHED_RESET_ON_FORK;
+#ifdef SCHED_RESET_ON_FORK  // Linux, where pthread_getschedparam may return a former priority
+  policy = sched_getscheduler(0) & ~SCHED_RESET_ON_FORK;
+  sched_getparam(0, &level);
 #endif
+  if (pthread_attr_init(&like_caller) != 0) return false;
   if (policy == SCHED_RR || policy == SCHED_FIFO) {
     pthread_attr_setinheritsched(&like_caller, PTHREAD_EXPLICIT_SCHED);
     pthread_attr_setschedpolicy(&like_caller, policy);
     pthread_attr_setschedparam(&like_caller, &level);
   }
-  const bool started = pthread_create(&thread, &like_caller, draw_part, &part) == 0;
+  const bool started = pthread_create(&thread, &like_caller, draw_part, &part) == 0 ||
+                       pthread_create(&thread, nullptr, draw_part, &part) == 0;  // without the right to the priority
   pthread_attr_destroy(&like_caller);
   return started;
 }

@@ -39,7 +39,7 @@ class PanelWindows(ABC):
 
     @property
     def show_ns(self) -> int:
-        """Time from calling `show` until all panels show the frame, without waiting for vertical blanks."""
+        """Time from calling `show` until all panels show a new frame. 0 if unknown."""
         return 0
 
     @property
@@ -206,14 +206,16 @@ class ProcessorWindows(PanelWindows):
         self._changed = self._painter.draw(frame)
 
     def show(self, clock: Clock) -> tuple[int, int]:
+        shown = 0
         for panel, (window, picture) in enumerate(zip(self.windows, self._pictures, strict=True)):
             if panel in self._changed or window.exposed:
                 window.exposed = False
                 picture.put()
+                shown += 1
         flush(x_display())
         # The X server copies the pictures meanwhile. Waiting for it would leave too little time to draw the next frame.
         now_ns = clock.now_ns()
-        return now_ns + self._copy_ns, now_ns + self.show_ns
+        return now_ns + min(shown, 1) * self._copy_ns, now_ns + shown * self._copy_ns
 
     def release(self) -> None:
         for picture in self._pictures:
@@ -279,7 +281,7 @@ def _processor_windows(
     for number, (panel, monitor) in enumerate(zip(panels, monitors, strict=True)):
         mounting = Mounting.of(panel, screen_px=monitor.size_px, layer_px=layer_px)
         if mounting is None:
-            log.warning("there is no GPU, and panel %d's homography needs OpenGL: drawing will be slow", number)
+            log.warning("there is no GPU, and panel %d must be resampled by OpenGL: drawing will be slow", number)
             return None
         mountings.append(mounting)
     try:

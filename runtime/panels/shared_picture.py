@@ -150,6 +150,7 @@ class SharedPicture:
             system.shmctl(self._segment.id, REMOVE, None)
             raise NotShared(f"no shared memory: {os.strerror(ctypes.get_errno())}")
         self._segment.address = image.data = address
+        x11.XSync(self._display, 0)  # so that only this request is counted
         refused = xlib.refusals()
         self._attached = bool(extensions.XShmAttach(self._display, byref(self._segment)))
         x11.XSync(self._display, 0)

@@ -29,7 +29,7 @@ LOOK_NS = 5 * NS_PER_S  # interval between searches for monitors if X sends no n
 class WindowPanels(PanelSink):
     """Output to X11 monitors, using one fullscreen window for each panel.
 
-    `present` uploads a new solution once, draws it for all windows and then shows all windows one right after another.
+    `present` prepares a new solution once, draws it for all windows and then shows all windows one right after another.
     If anything fails before the first is shown, the old frame stays on all panels. With OpenGL, only the first window
     waits for its vertical blank, because with N windows waiting, the refresh rate would be divided by N. `skew_ms` is
     the time from when the first panel is shown until the last one is. It does not include phase differences between the
@@ -133,7 +133,7 @@ class WindowPanels(PanelSink):
             raise PanelLost(fault)
         if unchanged and self._shown and not windows.damaged:
             return PresentReport(frame.number, self._clock.now_ns(), 0.0)
-        self._away = windows.opengl
+        self._away |= windows.opengl
         windows.draw(frame)
         held_ns = None
         if due_ns is not None and not windows.opengl:

@@ -61,6 +61,31 @@ def test_a_frame_that_can_be_held_is_late_only_rarely() -> None:
     assert late < 0.03 * 2000
 
 
+def test_refreshes_that_draw_nothing_do_not_make_the_next_frame_late() -> None:
+    paced, now_ns = pacer(), 0
+    for number in range(400):
+        timing = paced.predict(now_ns)
+        woke_ns = max(now_ns, timing.wake_ns)
+        if number % 4:
+            now_ns = woke_ns + NS_PER_MS
+            shown_ns = paced.presented(timing, woke_ns=woke_ns, done_ns=now_ns)
+            assert number < 40 or shown_ns == timing.present_ns + PHOTON_NS  # the old picture stays, on time
+            continue
+        ready_ns = woke_ns + 12 * NS_PER_MS
+        now_ns = max(ready_ns, timing.present_ns)
+        paced.presented(timing, woke_ns=woke_ns, done_ns=now_ns, held_ns=now_ns - ready_ns)
+        assert number < 40 or ready_ns <= timing.present_ns + NS_PER_MS
+
+
+def test_a_late_held_frame_is_told_late_even_after_outputs_with_blanks() -> None:
+    paced = pacer()
+    timing = paced.predict(0)
+    paced.presented(timing, woke_ns=0, done_ns=NS_PER_MS, blank_ns=NS_PER_MS)
+    timing = paced.predict(PERIOD_NS)
+    late_ns = timing.present_ns + 3 * NS_PER_MS
+    assert paced.presented(timing, woke_ns=PERIOD_NS, done_ns=late_ns, held_ns=0) == late_ns + PHOTON_NS
+
+
 @pytest.mark.parametrize(("late_periods", "skipped"), [(0.4, 0), (0.6, 1), (1.4, 1), (1.6, 2), (10.6, 11)])
 def test_a_late_refresh_takes_a_later_slot_and_skipped_ones_are_missed(late_periods: float, skipped: int) -> None:
     paced = pacer()

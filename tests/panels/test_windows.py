@@ -197,11 +197,14 @@ def test_a_frame_drawn_early_is_shown_when_it_is_due(opened: Callable[..., Any])
 
 
 @PROCESSOR
-def test_a_registered_panel_is_drawn_by_opengl(opened: Callable[..., Any], caplog: pytest.LogCaptureFixture) -> None:
-    bent = ((1.0, 0.01, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+@pytest.mark.parametrize("bent", [((1.0, 0.01, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+                                  ((1.0, 0.0, 5.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))])  # fmt: skip
+def test_a_registered_panel_is_drawn_by_opengl(
+    opened: Callable[..., Any], caplog: pytest.LogCaptureFixture, bent: Any
+) -> None:
     sink = opened(PanelSettings(connector="DUMMY2", homography=bent), *BY_CONNECTOR[1:])
     assert presents(sink, 0)
-    assert "panel 0's homography needs OpenGL" in caplog.text
+    assert "panel 0 must be resampled by OpenGL" in caplog.text
 
 
 @pytest.mark.skipif(os.getuid() != 0 or shutil.which("unshare") is None, reason="needs root and unshare")
