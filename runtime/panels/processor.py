@@ -1,7 +1,7 @@
 """Draw the panels' pictures on the processor, for display PCs without a GPU.
 
 A software rasteriser runs the shader of `presentation` for one pixel after another and takes ten times as long. Both
-follow `runtime.optics.alignment.shown_layers`. Except for coarse solutions, the pictures are the same to within rounding.
+follow `runtime.optics.alignment.shown_layers`. Except for coarse solutions, the pictures are equal to within rounding.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from runtime.panels.geometry import layer_from_screen, panel_from_screen, permut
 from runtime.panels.presentation import shows_flat, shows_solved
 from runtime.records import F32, U8, PanelFrame
 
-# Solutions coarser than the panels by this factor are sampled at every other pixel. The pixels between are averages. On the
-# demo scene, this costs 0.02 to 0.2 dB of light.
+# Solutions coarser than the panels by this factor are sampled at every other pixel. The pixels between are averages.
+# On the demo scene, this costs 0.02 to 0.2 dB of light.
 COARSE = 2.5
 MOST_THREADS = 4  # more threads would be limited by the memory
 Array = TypeVar("Array", U8, F32)
