@@ -130,7 +130,7 @@ class PresentReport:
     present_ns: int  # estimated time when the last panel was lit
     skew_ms: float  # time between the buffer swaps of the first and the last panel
     vblank_ns: int | None = None  # estimated time of the refresh's vertical blank; None: not applicable
-    held_ns: int | None = None  # time for which a drawn frame was held back until it was due; None: never held back
+    held_ns: int | None = None  # wait of the drawn frame until it was due; None: not drawn, or never waits
 
 
 @dataclass(frozen=True, slots=True)

@@ -83,14 +83,15 @@ class Pacer:
             done_ns: When presenting was done.
             blank_ns: Time of the vertical blank at which the refresh appeared. None if the display driver does not
                 report blanks or skipped the swap.
-            held_ns: Time for which the drawn frame was held back until it was due. None if the output never does that.
+            held_ns: How long the drawn frame waited until it was due. None if no frame was drawn or the output never
+                waits.
         """
         self._holds = held_ns is not None or (self._holds and blank_ns is None)
         if held_ns is not None:
             self._has_blanks = False
             self._learn_work(done_ns - woke_ns - held_ns, fall=HELD_GAIN, most=MOST_HELD_WORK)
             return done_ns + self._photon_ns
-        if blank_ns is None and self._holds:  # nothing was drawn
+        if blank_ns is None and self._holds:  # the old picture stays on screen
             return timing.present_ns + self._photon_ns
         if blank_ns is None:
             self._learn_work(done_ns - woke_ns, fall=WORK_GAIN, most=MOST_WORK)

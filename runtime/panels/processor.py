@@ -7,7 +7,7 @@ follow `runtime.optics.alignment.shown_layers`. Except for coarse solutions, the
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
 
@@ -31,7 +31,7 @@ MOST_THREADS = 4  # more threads would be limited by the memory
 Array = TypeVar("Array", U8, F32)
 
 
-Line = tuple[float, float]  # scale and shift along an axis
+Line = tuple[float, float]  # scale, and shift in pixels, of a map along one axis
 
 
 class Axis(NamedTuple):
@@ -164,12 +164,15 @@ class ProcessorPainter:
     def _prepared(self, layers: U8, *, border_px: int, extended: bool = False) -> tuple[U8, ...]:
         """Turn layers for the monitors, and surround them with the rest code.
 
+        Layers of the same size and border reuse the memory of the last ones.
+
         Args:
             layers: (N, h, w, 4) RGBA layers.
             border_px: Width of the border.
             extended: True to repeat the layers' edge pixels in the innermost pixel of the border.
         """
-        turned = [np.ascontiguousarray(mounting.on_screen(layer)) for layer, mounting in self._pairs(layers)]
+        mounted = zip(layers, self._mountings, strict=True)
+        turned = [np.ascontiguousarray(mounting.on_screen(layer)) for layer, mounting in mounted]
         key = layers.shape, border_px
         if key not in self._memory:
             rest = min(rest_code(len(layers)), 255)
@@ -187,9 +190,6 @@ class ProcessorPainter:
                 inner[0, 1:-1], inner[-1, 1:-1] = inner[1, 1:-1], inner[-2, 1:-1]
                 inner[:, 0], inner[:, -1] = inner[:, 1], inner[:, -2]
         return pictures
-
-    def _pairs(self, layers: U8) -> Iterator[tuple[U8, Mounting]]:
-        return zip(layers, self._mountings, strict=True)
 
     def _shown(
         self, panel: int, frame: PanelFrame, solved: _Pictures | None, flat: _Pictures | None
