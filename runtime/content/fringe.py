@@ -6,17 +6,18 @@ hundred edges. Each ramp is one pixel wide, so objects are enlarged by half a pi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from ctypes import byref
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runtime.content.shapes import I32, Shape, welded
+from runtime.kernels import OutlinedPart, Raster, library
 from runtime.records import F32, F64
 
-CORNER_ENDS = (0, 1, 0, 1)  # two corners on the edge, then two outside the outline
+CORNER_FLOATS = 5 + 9  # clip coordinates and coverage (5), attributes (9)
 TRIANGLES = (0, 2, 1, 1, 2, 3)
 
 
@@ -29,7 +30,11 @@ class Edges:
     apex: I32  # (e, 2) third vertex of each face
     normals: F64  # (t, 3) unnormalised normals of all faces
     heights: F64  # (t,) plane offsets; a face is visible from an eye if eye · normal > height
-    border: NDArray[np.bool_]  # (e,) True for edges with a single face
+
+    @property
+    def border(self) -> NDArray[np.bool_]:
+        """True for edges with a single face, shape (e,)."""
+        return self.faces[:, 1] < 0
 
 
 def edges_of(shape: Shape) -> Edges:
@@ -60,90 +65,59 @@ def edges_of(shape: Shape) -> Edges:
         apex=np.column_stack([apex[one], np.where(paired, apex[two], apex[one])]).astype(np.int32),
         normals=normals,
         heights=np.einsum("ij,ij->i", normals, corner.mean(1)),
-        border=~paired,
     )
 
 
-class Outlines:
-    """The edges of several parts. `seen` selects the ones that are on an outline as seen by an eye."""
+class OutlineRamps:
+    """Builds ramps along the outlines of parts: quadrilaterals whose coverage falls from 1 at the edge to 0 outside."""
 
-    def __init__(self, each: Sequence[Edges], *, vertices: Sequence[int]) -> None:
-        """Combine the edges of all parts. Vertices are numbered consecutively across the parts.
+    def __init__(self, parts: Mapping[int, tuple[Edges, F32]]) -> None:
+        """Prepare to build ramps.
 
         Args:
-            each: Edges of each part.
-            vertices: Number of vertices in each part.
+            parts: For each part, by number, its edges and its vertices (v, 12). A vertex consists of its position in
+                the part's frame (3), and attributes that the ramps' corners take from it.
         """
-        faces_before = np.cumsum([0, *(len(edges.normals) for edges in each)])
-        self.vertices_before = np.cumsum([0, *vertices])
-        self._faces = list(pairwise(faces_before.tolist()))
-        self._edges = Edges(
-            faces=np.concatenate([edges.faces + n for edges, n in zip(each, faces_before, strict=False)]),
-            ends=np.concatenate([edges.ends + n for edges, n in zip(each, self.vertices_before, strict=False)]),
-            apex=np.concatenate([edges.apex + n for edges, n in zip(each, self.vertices_before, strict=False)]),
-            normals=np.concatenate([edges.normals for edges in each]),
-            heights=np.concatenate([edges.heights for edges in each]),
-            border=np.concatenate([edges.border for edges in each]),
-        )
-        self._part = np.repeat(np.arange(len(each)), [len(edges.faces) for edges in each])
-        self._first, self._second = np.ascontiguousarray(self._edges.faces.T, np.intp)
+        self._held = parts
+        self._index = {number: n for n, number in enumerate(parts)}
+        self._parts = (OutlinedPart * len(parts))(*(_outlined(*part) for part in parts.values()))
+        self._ramps = np.empty((sum(len(edges.faces) for edges, _ in parts.values()), 4, CORNER_FLOATS), np.float32)
 
-    def seen(self, eyes: Sequence[F64 | None]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Return the edges that are on an outline, and the index of each edge's part.
+    def along(
+        self, seen: Sequence[tuple[int, F64, F64]], *, width_px: int, height_px: int, ramp_px: float = 1.0
+    ) -> tuple[F32, list[int]]:
+        """Return the ramps along the outlines of parts.
 
-        Each edge is described by three vertices: its ends and the third vertex of its visible face. All parts' normals
-        must point outwards.
+        An edge gets no ramp if it is partly behind the eye or too short to have a direction.
 
         Args:
-            eyes: For each part, the eye's position (3,) in the part's frame, or None to exclude the part.
+            seen: The parts in the order in which to return their ramps. For each, its number, the eye (3,) in the
+                part's frame, and its 4x4 clip matrix. The parts' normals must point outwards.
+            width_px: Raster width.
+            height_px: Raster height.
+            ramp_px: Ramp width in pixels.
 
         Returns:
-            The vertices (k, 3) and part indices (k,) of k edges.
+            Ramps (m, 4, CORNER_FLOATS), valid until the next call, and how many of them each part has. Each ramp has
+            two corners on its edge and then two outside the outline. A corner consists of clip coordinates (4),
+            coverage, and the attributes (9) of the edge's vertex that it is at or beside. `TRIANGLES` states which
+            corners form a ramp's two triangles.
         """
-        edges = self._edges
-        facing = np.zeros(len(edges.normals), bool)
-        for (begin, end), eye in zip(self._faces, eyes, strict=True):
-            if eye is not None:
-                facing[begin:end] = edges.normals[begin:end] @ eye > edges.heights[begin:end]
-        first = facing[self._first]
-        chosen = np.flatnonzero(edges.border | (first != facing[self._second]))
-        if any(eye is None for eye in eyes):
-            chosen = chosen[np.array([eye is not None for eye in eyes])[self._part[chosen]]]
-        which = np.where(edges.border[chosen] | first[chosen], 0, 1)
-        return np.column_stack([edges.ends[chosen, which], edges.apex[chosen, which]]), self._part[chosen]
+        order, counts = (
+            np.array([self._index[number] for number, _, _ in seen], np.int32),
+            np.zeros(len(seen), np.int32),
+        )
+        for n, (_, eye, clip_from_part) in zip(order.tolist(), seen, strict=True):
+            self._parts[n].eye[:] = eye.tolist()
+            self._parts[n].clip_from_part[:] = clip_from_part.ravel().tolist()
+        raster = Raster(width_px, height_px, ramp_px)
+        library().outline_ramps(
+            self._parts, order.ctypes.data, len(seen), byref(raster), self._ramps.ctypes.data, counts.ctypes.data
+        )
+        return self._ramps[: counts.sum()], counts.tolist()
 
 
-def ramps(points: F64, *, width_px: int, height_px: int, ramp_px: float = 1.0) -> tuple[F32, NDArray[np.intp]]:
-    """Return a ramp, a quadrilateral, for each outline edge.
-
-    A ramp's coverage falls from 1 at the edge to 0 outside the outline. An edge gets no ramp if it is partly behind the
-    eye or too short to have a direction.
-
-    Args:
-        points: Clip coordinates (k, 3, 4) of each edge's two ends and of the third vertex of its visible face.
-        width_px: Raster width.
-        height_px: Raster height.
-        ramp_px: Ramp width in pixels.
-
-    Returns:
-        Clip coordinates and coverage (m, 4, 5) at the four corners of each of m ramps, and the index (m,) of each
-        ramp's edge. `CORNER_ENDS` states which end of the edge each corner takes its attributes from, and `TRIANGLES`
-        which corners form the two triangles.
-    """
-    kept = np.flatnonzero((points[..., 3] > 1e-6).all(1))
-    points = points[kept]
-    w = points[..., 3]
-    u, v = points[..., 0] / w * (width_px / 2), points[..., 1] / w * (height_px / 2)
-    along_u, along_v = u[:, 1] - u[:, 0], v[:, 1] - v[:, 0]
-    length = np.hypot(along_u, along_v)
-    long_enough = length > 1e-3
-    kept, points = kept[long_enough], points[long_enough]
-    length, along_u, along_v = length[long_enough], along_u[long_enough], along_v[long_enough]
-    inside = (v[long_enough, 2] - v[long_enough, 0]) * along_u - (u[long_enough, 2] - u[long_enough, 0]) * along_v
-    outward = np.where(inside > 0, -ramp_px, ramp_px) / length
-    corners = np.empty((len(kept), 4, 5), np.float32)
-    corners[:, :2, :4] = corners[:, 2:, :4] = points[:, :2]
-    corners[:, 2:, 0] -= (along_v * outward / (width_px / 2))[:, None] * points[:, :2, 3]
-    corners[:, 2:, 1] += (along_u * outward / (height_px / 2))[:, None] * points[:, :2, 3]
-    corners[:, :2, 4], corners[:, 2:, 4] = 1.0, 0.0
-    return corners, kept
+def _outlined(edges: Edges, vertices: F32) -> OutlinedPart:
+    arrays = vertices, edges.faces, edges.ends, edges.apex, edges.normals, edges.heights
+    assert all(array.flags.c_contiguous for array in arrays)
+    return OutlinedPart(*(array.ctypes.data for array in arrays), len(edges.faces), len(edges.heights))

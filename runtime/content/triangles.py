@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 from runtime.content import camera
 from runtime.content.base import ContentInfo, View
 from runtime.content.canvas import OVER, CanvasSource
-from runtime.content.fringe import CORNER_ENDS, TRIANGLES, Outlines, edges_of, ramps
+from runtime.content.fringe import CORNER_FLOATS, TRIANGLES, OutlineRamps, edges_of
 from runtime.content.parts import OPAQUE_FROM, OUTLINED_MAX, Part, Sampler
 from runtime.content.shapes import solid_winding
 from runtime.optics.rect import PixelRect
@@ -29,7 +28,6 @@ PROJECTED_MAX = 5000  # if a part has more vertices, its box is projected instea
 DRAWN_AT_ONCE = 20_000  # triangles per draw call
 UPLOADED_AT_ONCE = 8 << 20  # bytes per upload
 ATTRIBUTES = ("in_normal", "in_uv", "in_colour")
-OUTLINE_FLOATS = 5 + 9  # floats per corner: clip coordinates and coverage (5), attributes (9)
 
 ANY_ALPHA = 2.0  # limit that is larger than any alpha
 VERTEX = """
@@ -236,11 +234,6 @@ class _Look:
         self.clip_from_part = clip_from_stack @ place.stack_from_part
         self._clip, self._normals = _gl(self.clip_from_part), _gl(turned)
 
-    def project(self, points: F64) -> F64:
-        """Return the clip coordinates (k, n, 4) of points (k, n, 3) in the part's frame."""
-        clip = points.reshape(-1, 3) @ self.clip_from_part[:, :3].T + self.clip_from_part[:, 3]
-        return np.asarray(clip.reshape(*points.shape[:2], 4), np.float64)
-
     def set(self, program: Any, part: DrawnPart) -> None:
         """Set the uniforms and textures that a program needs to draw a part."""
         for name, matrix in (("stack_from_part", self._normals), ("clip_from_part", self._clip)):
@@ -289,17 +282,10 @@ class TriangleSource(CanvasSource):
         self._still: _Arrangement | None = None  # arrangement, if the scene is static
         self._programs: dict[tuple[str, ...], Any] = {}
         self._textures: dict[tuple[int, Sampler], Any] = {}
-        self._outlined = [(n, part, part.edges) for n, part in enumerate(self.parts) if part.edges is not None]
-        edges = sum(len(edges.faces) for _, _, edges in self._outlined)
-        if self._outlined:
-            counts = [len(part.vertices) for _, part, _ in self._outlined]
-            self._edges = Outlines([edges for _, _, edges in self._outlined], vertices=counts)
-            self._corners = np.concatenate([part.vertices for _, part, _ in self._outlined])
-            for (begin, end), (_, part, _) in zip(pairwise(self._edges.vertices_before), self._outlined, strict=True):
-                part.vertices = self._corners[begin:end]  # a view avoids a second copy
-        first_corners = len(CORNER_ENDS) * np.arange(max(edges, 1), dtype=np.int32)
-        floats = first_corners.size * len(CORNER_ENDS) * OUTLINE_FLOATS
-        self._outline_buffer = context.buffer(reserve=4 * floats, dynamic=True)
+        outlined = {n: (part.edges, part.vertices) for n, part in enumerate(self.parts) if part.edges is not None}
+        self._ramps = OutlineRamps(outlined) if outlined and self._with_ramps else None
+        first_corners = 4 * np.arange(max(sum(len(edges.faces) for edges, _ in outlined.values()), 1), dtype=np.int32)
+        self._outline_buffer = context.buffer(reserve=4 * 4 * CORNER_FLOATS * first_corners.size, dynamic=True)
         self._outline_triangles = context.buffer(first_corners[:, None] + np.array(TRIANGLES, np.int32))
         self._outlines: dict[tuple[str, ...], Any] = {}
         for part in self.parts:
@@ -360,8 +346,8 @@ class TriangleSource(CanvasSource):
                 least = OPAQUE_FROM if part.is_blended else part.cutoff
                 _set_uniforms(part.surface_program, kept=(least, ANY_ALPHA))
                 part.draw_surface()
-            if self._with_ramps and self._outlined:
-                self._draw_outlines(looks, arranged.nearest_first, view)
+            if self._ramps is not None:
+                self._draw_outlines(self._ramps, looks, arranged.nearest_first, view)
             if any(part.is_blended for part in self.parts):
                 self._draw_translucent(placed)
 
@@ -421,33 +407,30 @@ class TriangleSource(CanvasSource):
             self._textures[key] = texture
         return self._textures[key]
 
-    def _draw_outlines(self, looks: list[_Look], nearest_first: NDArray[np.intp], view: View) -> None:
+    def _draw_outlines(
+        self, ramps: OutlineRamps, looks: list[_Look], nearest_first: NDArray[np.intp], view: View
+    ) -> None:
         """Draw ramps along all parts' outlines, farthest part first."""
-        eyes = [looks[n].eye for n, _, _ in self._outlined]
-        seen, of_part = self._edges.seen(eyes)
-        rank = np.argsort(nearest_first)[[n for n, _, _ in self._outlined]]
-        order = np.argsort(-rank[of_part], kind="stable")
-        seen, of_part = seen[order], of_part[order]
-        ends = np.flatnonzero(np.diff(of_part, append=-1)) + 1
-        points, clip = self._corners[seen, :3].astype(np.float64), np.empty((len(seen), 3, 4))
-        for begin, end in pairwise([0, *ends.tolist()]):
-            clip[begin:end] = looks[self._outlined[of_part[begin]][0]].project(points[begin:end])
+        seen = [
+            (n, eye, looks[n].clip_from_part)
+            for n in nearest_first[::-1].tolist()
+            if self.parts[n].edges is not None and (eye := looks[n].eye) is not None
+        ]
         size = {"width_px": view.width_px, "height_px": view.height_px}
-        corners, kept = ramps(clip, **size, ramp_px=1 / view.reduction)
-        packed = np.empty((len(kept), len(CORNER_ENDS), OUTLINE_FLOATS), np.float32)
-        packed[..., :5] = corners
-        packed[..., 5:] = self._corners[seen[kept][:, CORNER_ENDS], 3:]
-        self._outline_buffer.write(packed)
+        corners, counts = ramps.along(seen, **size, ramp_px=1 / view.reduction)
+        self._outline_buffer.write(corners)
         context, framebuffer = self.context, self.context.fbo
         context.enable_only(context.DEPTH_TEST | context.BLEND)
         context.blend_func = OVER
         framebuffer.depth_mask = False
-        begins = np.flatnonzero(np.diff(of_part[kept], prepend=-1)).tolist()
-        for begin, end in pairwise([*begins, len(kept)]):
-            n, part, _ = self._outlined[of_part[kept[begin]]]
-            looks[n].set(part.outline.program, part)
-            _set_uniforms(part.outline.program, kept=(part.cutoff, ANY_ALPHA))
-            part.outline.render(first=len(TRIANGLES) * begin, vertices=len(TRIANGLES) * (end - begin))
+        begin = 0
+        for (n, _, _), count in zip(seen, counts, strict=True):
+            if count:
+                part = self.parts[n]
+                looks[n].set(part.outline.program, part)
+                _set_uniforms(part.outline.program, kept=(part.cutoff, ANY_ALPHA))
+                part.outline.render(first=len(TRIANGLES) * begin, vertices=len(TRIANGLES) * count)
+                begin += count
         framebuffer.depth_mask = True
 
 

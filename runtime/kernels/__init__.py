@@ -111,9 +111,25 @@ class ShownPanel(ctypes.Structure):
     )  # fmt: skip
 
 
+class OutlinedPart(ctypes.Structure):
+    """One part's edges, and the eye and matrix for which its outline's ramps are built."""
+
+    _fields_ = (
+        ("vertices", _pointer), ("faces", _pointer), ("ends", _pointer), ("apex", _pointer), ("normals", _pointer),
+        ("heights", _pointer), ("edges", _int), ("triangles", _int),
+        ("eye", _double * 3), ("clip_from_part", _double * 16),
+    )  # fmt: skip
+
+
+class Raster(ctypes.Structure):
+    """Size of the raster that ramps are drawn on, and their width."""
+
+    _fields_ = (("width_px", _double), ("height_px", _double), ("ramp_px", _double))
+
+
 COMPILED = {
     "problem_bytes": ctypes.sizeof(Problem), "warp_bytes": ctypes.sizeof(Warp), "view_bytes": ctypes.sizeof(KernelView),
-    "shown_bytes": ctypes.sizeof(ShownPanel), "max_sets": MAX_SETS,
+    "shown_bytes": ctypes.sizeof(ShownPanel), "outlined_part_bytes": ctypes.sizeof(OutlinedPart), "max_sets": MAX_SETS,
 }  # fmt: skip
 
 
@@ -132,6 +148,7 @@ def library() -> Any:
         "warp": (_pointer, _pointer, _pointer, _int, _int, _int, _int),
         "squared_error": (_pointer, _int, _int, _pointer),
         "draw_panels": (_pointer, _int, _int),
+        "outline_ramps": (_pointer, _pointer, _int, _pointer, _pointer, _pointer),
     }.items():
         function = getattr(loops, name, None)
         if function is None:

@@ -8,13 +8,36 @@ import numpy as np
 import pytest
 
 from runtime.content import shapes
-from runtime.content.fringe import Outlines, edges_of, ramps
+from runtime.content.fringe import OutlineRamps, edges_of
 from runtime.content.shapes import Shape
 
+TILTED = np.array([[0.3, 2, 0.1, 0], [0.1, 0.2, -2, 0], [0, 0, 0, 0], [-1, -0.1, 0.1, 100.0]])
 
-def outline(shape: Shape, eye: list[float]) -> Any:
-    """(k, 3) both ends and the apex of every edge on the outline that an eye sees."""
-    return Outlines([edges_of(shape)], vertices=[len(shape.positions_m)]).seen([np.array(eye)])[0]
+
+def vertices_of(shape: Shape) -> Any:
+    """(v, 12) positions, then attributes, of which the first is the vertex's number."""
+    vertices = np.zeros((len(shape.positions_m), 12), np.float32)
+    vertices[:, :3], vertices[:, 3] = shape.positions_m, np.arange(len(vertices))
+    return vertices
+
+
+def from_x(distance_m: float) -> Any:
+    """Clip matrix of an eye on the x axis: a picture of 1 x 1 at a distance of 1."""
+    return np.array([[0.0, 2, 0, 0], [0, 0, -2, 0], [0, 0, 0, 0], [-1, 0, 0, distance_m]])
+
+
+def ramps(shape: Shape, eye: list[float], clip: Any = from_x(100.0), **size: Any) -> Any:
+    """Ramps (m, 4, 14) along the outline that an eye sees."""
+    size = size or {"width_px": 4000, "height_px": 4000}
+    found = OutlineRamps({7: (edges_of(shape), vertices_of(shape))}).along([(7, np.array(eye), clip)], **size)
+    assert found[1] == [len(found[0])]
+    return found[0].copy()
+
+
+def ends(found: Any) -> Any:
+    """(m, 2) numbers of the vertices at the ramps' ends."""
+    assert np.array_equal(found[:, :2, 5:], found[:, 2:, 5:])
+    return found[:, :2, 5].astype(int)
 
 
 def test_the_diagonals_of_a_box_s_faces_are_no_outlines() -> None:
@@ -22,33 +45,41 @@ def test_the_diagonals_of_a_box_s_faces_are_no_outlines() -> None:
     edges = edges_of(box)
     assert len(edges.faces) == 12 + 6
     assert (edges.faces >= 0).all()
-    assert len(outline(box, [10.0, 0.0, 0.0])) == 4
-    assert len(outline(box, [10.0, 20.0, 30.0])) == 6
+    assert len(ramps(box, [10.0, 0.0, 0.0])) == 4
+    assert len(ramps(box, [10.0, 20.0, 30.0], TILTED)) == 6
 
 
-def test_outlines_of_several_parts_are_those_of_each() -> None:
-    parts = [shapes.box((1.0, 2.0, 3.0)), shapes.card(1.0, 1.0), shapes.sphere(1.0)]
-    eyes = [np.array([10.0, 3.0 * n, 1.0]) for n in range(3)]
-    counts = [len(shape.positions_m) for shape in parts]
-    together = Outlines([edges_of(shape) for shape in parts], vertices=counts)
-    seen, of_part = together.seen(eyes)
-    for n, shape in enumerate(parts):
-        assert np.array_equal(seen[of_part == n] - sum(counts[:n]), outline(shape, list(eyes[n])))
-    assert set(together.seen([eyes[0], None, eyes[2]])[1]) == {0, 2}, "a part without an inside has no outline"
+def test_outlines_of_several_parts_come_in_the_order_asked_for() -> None:
+    parts = {
+        n: shape for n, shape in enumerate([shapes.box((1.0, 2.0, 3.0)), shapes.card(1.0, 1.0), shapes.sphere(1.0)])
+    }
+    eyes = [np.array([100.0, 3.0 * n, 1.0]) for n in range(3)]
+    together = OutlineRamps({n: (edges_of(shape), vertices_of(shape)) for n, shape in parts.items()})
+    size = {"width_px": 4000, "height_px": 4000}
+    found, counts = together.along([(n, eyes[n], from_x(100.0)) for n in (2, 0)], **size)
+    assert len(found) == sum(counts)
+    for n, part in zip((2, 0), np.split(found, [counts[0]]), strict=True):
+        assert np.array_equal(part, ramps(parts[n], eyes[n].tolist()))
+
+
+def test_an_edge_behind_the_eye_has_no_ramp() -> None:
+    card = shapes.card(1.0, 1.0)
+    assert len(ramps(card, [100.0, 0.0, 0.0])) == 4
+    assert len(ramps(card, [100.0, 0.0, 0.0], from_x(-1.0))) == 0
 
 
 def test_a_sphere_s_outline_is_a_closed_ring() -> None:
     ball = shapes.sphere(1.0)
-    ends = outline(ball, [4.0, 1.0, 0.5])[:, :2]
-    places = np.unique(np.rint(ball.positions_m[ends].reshape(-1, 3) * 1e4).astype(int), axis=0, return_counts=True)[1]
+    at = ends(ramps(ball, [4.0, 1.0, 0.5], TILTED))
+    places = np.unique(np.rint(ball.positions_m[at].reshape(-1, 3) * 1e4).astype(int), axis=0, return_counts=True)[1]
     assert (places == 2).all()
 
 
 def test_the_ramp_is_one_pixel_wide_and_lies_outside() -> None:
     card = shapes.card(1.0, 1.0)
-    seen = outline(card, [5.0, 0.0, 0.0])
-    clip = np.column_stack([card.positions_m[:, 1], -card.positions_m[:, 2], np.zeros(4), np.ones(4)]).astype(float)
-    corners, _ = ramps(clip[seen], width_px=100, height_px=50)
-    uncovered = corners[corners[..., 4] == 0]
-    reach = (np.abs(uncovered[:, :2]) - 0.5) * [50, 25]
-    assert reach.max(axis=1) == pytest.approx(np.ones(len(reach)), abs=1e-4)
+    plain = np.array([[0.0, 1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 0], [0, 0, 0, 1]])
+    corners = ramps(card, [5.0, 0.0, 0.0], plain, width_px=100, height_px=50)
+    assert (corners[:, :2, 4] == 1).all() and (corners[:, 2:, 4] == 0).all()
+    assert np.abs(corners[:, :2, :2]).max() == pytest.approx(0.5)
+    reach = (np.abs(corners[:, 2:, :2]) - 0.5) * [50, 25]
+    assert reach.reshape(-1, 4).max(axis=1) == pytest.approx(np.ones(4), abs=1e-4)

@@ -112,7 +112,7 @@ def test_outlines_are_smooth_and_grow_by_less_than_a_pixel(
 ) -> None:
     fine = PanelStack(stack.width_m, stack.height_m, stack.x_m, stack.width_px * 4, stack.height_px * 4)
     one_sample = ProceduralSource("demo", stack=stack, context=context)
-    one_sample._with_ramps = False
+    one_sample._ramps = None
     exact = one_sample.render(panel_view(eye, fine.panel(1)), time_ns=0)
     wanted = cv2.resize(exact, (stack.width_px, stack.height_px), interpolation=cv2.INTER_AREA)[..., 3].astype(float)
     hard = one_sample.render(panel_view(eye, stack.panel(1)), time_ns=0)[..., 3].astype(float)
