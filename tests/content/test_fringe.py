@@ -26,7 +26,10 @@ def from_x(distance_m: float) -> Any:
     return np.array([[0.0, 2, 0, 0], [0, 0, -2, 0], [0, 0, 0, 0], [-1, 0, 0, distance_m]])
 
 
-def ramps(shape: Shape, eye: list[float], clip: Any = from_x(100.0), **size: Any) -> Any:
+AHEAD = from_x(100.0)
+
+
+def ramps(shape: Shape, eye: list[float], clip: Any = AHEAD, **size: Any) -> Any:
     """Ramps (m, 4, 14) along the outline that an eye sees."""
     size = size or {"width_px": 4000, "height_px": 4000}
     found = OutlineRamps({7: (edges_of(shape), vertices_of(shape))}).along([(7, np.array(eye), clip)], **size)
@@ -56,7 +59,7 @@ def test_outlines_of_several_parts_come_in_the_order_asked_for() -> None:
     eyes = [np.array([100.0, 3.0 * n, 1.0]) for n in range(3)]
     together = OutlineRamps({n: (edges_of(shape), vertices_of(shape)) for n, shape in parts.items()})
     size = {"width_px": 4000, "height_px": 4000}
-    found, counts = together.along([(n, eyes[n], from_x(100.0)) for n in (2, 0)], **size)
+    found, counts = together.along([(n, eyes[n], AHEAD) for n in (2, 0)], **size)
     assert len(found) == sum(counts)
     for n, part in zip((2, 0), np.split(found, [counts[0]]), strict=True):
         assert np.array_equal(part, ramps(parts[n], eyes[n].tolist()))
