@@ -22,7 +22,7 @@ SUBCODE = 16  # fixed-point units per 8-bit panel code
 FULL = 255 * SUBCODE  # range of a panel value, which rotates the polarization by up to a quarter turn
 EDGE_PX = 4  # maximum distance, in pixels, that an image may be sampled beyond its edge
 EDGE_CLAMP_PX = 2  # distance, in pixels, that the values of a picture's border rays are repeated beyond it
-CURVE_STEPS = 16  # entries per code of a panel's grey curve
+CURVE_STEPS = 4  # entries per code of a panel's grey curve
 CURVE_ENTRIES = 256 * CURVE_STEPS
 TABLE_STEPS = 16  # table entries per code value, for the intensities of bilinearly sampled rays
 _AGAIN = "reinstall phasestack (this requires g++)"
@@ -105,9 +105,9 @@ class ShownPanel(ctypes.Structure):
         ("source", _pointer), ("source_stride", _long), ("screen", _pointer), ("screen_stride", _long),
         ("flat", _pointer), ("flat_stride", _long), ("curve", _pointer), ("relief", _pointer),
         ("source_rows", _int), ("source_columns", _int), ("rows", _int), ("columns", _int),
-        ("relief_rows", _int), ("relief_columns", _int),
-        ("source_from_screen", ScaleShift), ("relief_from_screen", ScaleShift), ("push", ScaleShift),
-        ("flatness", _float), ("every", _int),
+        ("relief_rows", _int), ("relief_columns", _int), ("panel_rows", _int), ("panel_columns", _int),
+        ("source_from_panel", ScaleShift), ("relief_from_screen", ScaleShift), ("push", ScaleShift),
+        ("registered", _int), ("panel_from_screen", _float * 9), ("flatness", _float), ("every", _int),
     )  # fmt: skip
 
 

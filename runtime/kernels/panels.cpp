@@ -1,6 +1,7 @@
 // Draw the panels' pictures on the processor (runtime/panels/processor.py): sample a layer, which may be coarse and
 // displaced by the content's relief, mix it with the flat picture and apply the panel's grey curve. Pixels have four
-// bytes. Positions in pictures count from the centre of the top left pixel, positions on the screen from its corner.
+// bytes. Positions in pictures count from the centre of the top left pixel, positions on the screen and the panel from
+// their corners. The panel's pixels are turned like the screen's, and coincide with them unless a homography is given.
 #include <pthread.h>
 #include <sched.h>
 
@@ -10,7 +11,7 @@
 
 namespace {
 
-constexpr int CURVE = 4096;      // entries of a grey curve for each channel, indexed by sixteenths of a code
+constexpr int CURVE = 1024;      // entries of a grey curve for each channel, indexed by quarters of a code
 constexpr int FRACTION = 7;      // fractional bits of values while pictures are interpolated and mixed
 constexpr int UNIT = 1 << 15;    // a pixel, and an interpolation weight of 1, in fixed point
 constexpr int BLOCK_PX = 64;     // columns drawn together; where the relief is zero, a block is cheaper
@@ -27,11 +28,13 @@ struct Shown {
   int64_t screen_stride;
   const uint8_t *flat;  // picture of the screen's size to mix in, or null
   int64_t flat_stride;
-  const uint8_t *curve;  // (3, CURVE) grey levels for a pixel's first three bytes, or null
+  const uint32_t *curve;  // (3, CURVE) pixels with one byte each: a pixel's bytes as grey levels; or null
   const float *relief;   // (relief_rows, relief_columns), or null
-  int32_t source_rows, source_columns, rows, columns, relief_rows, relief_columns;
-  ScaleShift source_from_screen, relief_from_screen;
-  ScaleShift push;  // displacement, in the source's pixels, by a relief of 1
+  int32_t source_rows, source_columns, rows, columns, relief_rows, relief_columns, panel_rows, panel_columns;
+  ScaleShift source_from_panel, relief_from_screen;
+  ScaleShift push;             // displacement, in the source's pixels, by a relief of 1, from positions on the panel
+  int32_t registered;          // 1 if `panel_from_screen` applies
+  float panel_from_screen[9];  // homography; outside the panel, the screen shows the value 0
   float flatness;   // weight of `flat`
   // 1 to sample every pixel; 2 to sample every other pixel of every other row and average between them, which needs
   // `flat` to be null.
@@ -44,6 +47,7 @@ typedef uint32_t Word __attribute__((may_alias));  // both of a pixel's pairs
 struct alignas(2 * LANES) Block {
   Pair right[2 * BLOCK_PX], down[2 * BLOCK_PX];  // for each pair, weights of the neighbours to the right and below
   int32_t offset[BLOCK_PX];                      // bytes from the source's first pixel to the top left neighbour
+  Pair inside[2 * BLOCK_PX];                     // for each pair of a registered panel, 0 outside the panel, or 0xFFFF
   Pair near[4][2 * BLOCK_PX];                    // neighbours: top left, top right, bottom left and bottom right
   int16_t even[2 * BLOCK_PX], odd[2 * BLOCK_PX];  // result: values of each pair's first and second byte
 };
@@ -105,9 +109,9 @@ INLINE const float *relief_row(const Shown &shown, Relief &kept, int row) {
 
 // Copy a row whose pixels coincide with the source's. Return false if the row must be drawn instead.
 INLINE bool copied(const Shown &shown, int r) {
-  const ScaleShift &at = shown.source_from_screen;
+  const ScaleShift &at = shown.source_from_panel;
   const float u = 0.5f + at.shift_u, v = float(r) + 0.5f + at.shift_v;
-  if (shown.relief || shown.flat || shown.curve || at.scale_u != 1 || at.scale_v != 1) return false;
+  if (shown.registered || shown.relief || shown.flat || shown.curve || at.scale_u != 1 || at.scale_v != 1) return false;
   if (u != std::floor(u) || v != std::floor(v) || u < 0 || v < 0) return false;
   if (int(u) + shown.columns > shown.source_columns || int(v) >= shown.source_rows) return false;
   const uint8_t *from = shown.source + int64_t(v) * shown.source_stride + int64_t(u) * 4;
@@ -118,7 +122,7 @@ INLINE bool copied(const Shown &shown, int r) {
 // Find the neighbours and weights of a block's pixels. Unless `upper` is null, they are displaced by the relief between
 // two of its rows.
 INLINE void locate(const Shown &shown, int r, int begin, int count, const float *upper, const float *lower, float share, Block &block) {
-  const ScaleShift at = shown.source_from_screen, push = shown.push;
+  const ScaleShift at = shown.source_from_panel, push = shown.push;
   const int32_t stride = int32_t(shown.source_stride), rows = shown.source_rows, columns = shown.source_columns;
   const float v = (float(r) + 0.5f) * at.scale_v + at.shift_v, push_v = (float(r) + 0.5f) * push.scale_v + push.shift_v;
   auto *right = reinterpret_cast<Word *>(block.right), *down = reinterpret_cast<Word *>(block.down);
@@ -138,6 +142,34 @@ INLINE void locate(const Shown &shown, int r, int begin, int count, const float 
     block.offset[k] = (y >> 15) * stride + (x >> 15) * 4;
     right[k] = twice(x & (UNIT - 1)), down[k] = twice(y & (UNIT - 1));
   }
+}
+
+// As `locate`, through the panel's homography.
+INLINE void locate_registered(const Shown &shown, int r, int begin, int count, const float *upper, const float *lower, float share, Block &block) {
+  const ScaleShift at = shown.source_from_panel, push = shown.push;
+  const int32_t stride = int32_t(shown.source_stride), rows = shown.source_rows, columns = shown.source_columns;
+  const float *h = shown.panel_from_screen, y = float(r) + 0.5f;
+  const float u0 = h[1] * y + h[2], v0 = h[4] * y + h[5], w0 = h[7] * y + h[8], uu = h[0], vu = h[3], wu = h[6];
+  const float right_px = float(shown.panel_columns), below_px = float(shown.panel_rows);
+  auto *right = reinterpret_cast<Word *>(block.right), *down = reinterpret_cast<Word *>(block.down);
+  auto *inside = reinterpret_cast<Word *>(block.inside);
+  float raised[BLOCK_PX] = {};
+  if (upper)
+    for (int k = 0; k < count; ++k) raised[k] = upper[begin + k] + (lower[begin + k] - upper[begin + k]) * share;
+  VECTORISED for (int k = 0; k < count; ++k) {
+    const float x = float(begin + k) + 0.5f, w = w0 + wu * x;
+    const float u = (u0 + uu * x) / w, v = (v0 + vu * x) / w, relief = raised[k];
+    const int32_t at_u = fixed(u * at.scale_u + at.shift_u + relief * (u * push.scale_u + push.shift_u), columns);
+    const int32_t at_v = fixed(v * at.scale_v + at.shift_v + relief * (v * push.scale_v + push.shift_v), rows);
+    block.offset[k] = (at_v >> 15) * stride + (at_u >> 15) * 4;
+    right[k] = twice(at_u & (UNIT - 1)), down[k] = twice(at_v & (UNIT - 1));
+    inside[k] = -uint32_t((w > 0) & (u >= 0) & (u < right_px) & (v >= 0) & (v < below_px));
+  }
+}
+
+INLINE void clear_outside(int count, Block &block) {
+  VECTORISED for (int k = 0; k < 2 * count; ++k)
+    block.even[k] = int16_t(block.even[k] & block.inside[k]), block.odd[k] = int16_t(block.odd[k] & block.inside[k]);
 }
 
 template <typename Half>
@@ -170,19 +202,24 @@ INLINE void mix_in(const uint8_t *flat, int16_t weight, int count, Block &block)
   }
 }
 
-INLINE void store(const Shown &shown, uint8_t *screen, int count, const Block &block) {
+// Return a value's entry in a grey curve.
+INLINE int16_t entry_of(int16_t value) {
+  constexpr int shift = FRACTION - 2;
+  return int16_t(uint16_t(value + (1 << (shift - 1))) >> shift);
+}
+
+INLINE void store(const Shown &shown, uint8_t *screen, int count, Block &block) {
   if (!shown.curve) {
     auto *pairs = reinterpret_cast<Pair *>(screen);
     VECTORISED for (int k = 0; k < 2 * count; ++k) pairs[k] = pair_of(block.even[k], block.odd[k]);
     return;
   }
-  const auto entry = [](int16_t value) { return (value + (1 << (FRACTION - 5))) >> (FRACTION - 4); };
-  for (int k = 0; k < count; ++k) {
-    screen[4 * k] = shown.curve[entry(block.even[2 * k])];
-    screen[4 * k + 1] = shown.curve[CURVE + entry(block.odd[2 * k])];
-    screen[4 * k + 2] = shown.curve[2 * CURVE + entry(block.even[2 * k + 1])];
-    screen[4 * k + 3] = 255;
-  }
+  VECTORISED for (int k = 0; k < 2 * count; ++k)
+    block.even[k] = entry_of(block.even[k]), block.odd[k] = entry_of(block.odd[k]);
+  auto *pixels = reinterpret_cast<Word *>(screen);
+  const uint32_t *blue = shown.curve, *green = blue + CURVE, *red = green + CURVE;
+  for (int k = 0; k < count; ++k)
+    pixels[k] = blue[block.even[2 * k]] | green[block.odd[2 * k]] | red[block.even[2 * k + 1]];
 }
 
 INLINE void draw_row(const Shown &shown, int r, uint8_t *screen, Relief &kept, Block &block) {
@@ -197,8 +234,10 @@ INLINE void draw_row(const Shown &shown, int r, uint8_t *screen, Relief &kept, B
   for (int c = 0; c < shown.columns; c += BLOCK_PX) {
     const int count = std::min(BLOCK_PX, shown.columns - c), n = c / BLOCK_PX;
     const bool rises = upper && (kept.rises[0][n] || kept.rises[1][n]);
-    locate(shown, r, c, count, rises ? upper : nullptr, lower, share, block);
+    if (shown.registered) locate_registered(shown, r, c, count, rises ? upper : nullptr, lower, share, block);
+    else locate(shown, r, c, count, rises ? upper : nullptr, lower, share, block);
     interpolate(shown, count, block);
+    if (shown.registered) clear_outside(count, block);
     if (shown.flat) {
       const uint8_t *flat = shown.flat + r * shown.flat_stride + 4 * c;
       mix_in(flat, int16_t(shown.flatness * (UNIT - 1) + 0.5f), count, block);
@@ -215,9 +254,14 @@ INLINE ScaleShift halved(const ScaleShift &map) {
 INLINE Shown halved(const Shown &shown) {
   Shown half = shown;
   half.rows = shown.rows / 2 + 1, half.columns = shown.columns / 2 + 1;
-  half.source_from_screen = halved(shown.source_from_screen);
   half.relief_from_screen = halved(shown.relief_from_screen);
-  half.push = halved(shown.push);
+  if (shown.registered) {
+    for (float *row = half.panel_from_screen; row < half.panel_from_screen + 9; row += 3)
+      row[2] -= 0.5f * (row[0] + row[1]), row[0] *= 2, row[1] *= 2;
+  } else {
+    half.source_from_panel = halved(shown.source_from_panel);
+    half.push = halved(shown.push);
+  }
   half.curve = nullptr;
   return half;
 }
@@ -233,14 +277,23 @@ INLINE uint8_t *bytes_of(std::vector<uint32_t> &line) { return reinterpret_cast<
 // Draw a row from every other pixel, and apply the curve.
 INLINE void widen(const Shown &shown, const uint32_t *line, uint8_t *screen) {
   auto *pixels = reinterpret_cast<Word *>(screen);
-  VECTORISED for (int k = 0; k < shown.columns / 2; ++k)
-    pixels[2 * k] = line[k], pixels[2 * k + 1] = average(line[k], line[k + 1]);
-  if (shown.columns % 2) pixels[shown.columns - 1] = line[shown.columns / 2];
-  if (!shown.curve) return;
-  constexpr int step = CURVE / 256;
-  for (int k = 0; k < 4 * shown.columns; k += 4)
-    for (int channel = 0; channel < 3; ++channel)
-      screen[k + channel] = shown.curve[channel * CURVE + screen[k + channel] * step];
+  const int step = CURVE / 256, pairs = shown.columns / 2;
+  const uint32_t *blue = shown.curve, *green = blue + CURVE, *red = green + CURVE;
+  const auto curved = [&](uint32_t pixel) {
+    return blue[(pixel & 255) * step] | green[(pixel >> 8 & 255) * step] | red[(pixel >> 16 & 255) * step];
+  };
+  uint32_t between[BLOCK_PX];
+  if (shown.curve) {
+    for (int from = 0; from < pairs; from += BLOCK_PX) {
+      const int count = std::min(BLOCK_PX, pairs - from);
+      average(line + from, line + from + 1, between, count);
+      for (int k = 0; k < count; ++k)
+        pixels[2 * (from + k)] = curved(line[from + k]), pixels[2 * (from + k) + 1] = curved(between[k]);
+    }
+  } else {
+    VECTORISED for (int k = 0; k < pairs; ++k) pixels[2 * k] = line[k], pixels[2 * k + 1] = average(line[k], line[k + 1]);
+  }
+  if (shown.columns % 2) pixels[shown.columns - 1] = shown.curve ? curved(line[pairs]) : line[pairs];
 }
 
 }  // namespace

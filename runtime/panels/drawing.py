@@ -277,13 +277,10 @@ def _processor_windows(
     clock: Clock,
 ) -> ProcessorWindows | None:
     """Open windows drawn by the processor, or return None and log why that is impossible."""
-    mountings = []
-    for number, (panel, monitor) in enumerate(zip(panels, monitors, strict=True)):
-        mounting = Mounting.of(panel, screen_px=monitor.size_px, layer_px=layer_px)
-        if mounting is None:
-            log.warning("there is no GPU, and panel %d must be resampled by OpenGL: drawing will be slow", number)
-            return None
-        mountings.append(mounting)
+    mountings = [
+        Mounting.of(panel, screen_px=monitor.size_px, layer_px=layer_px)
+        for panel, monitor in zip(panels, monitors, strict=True)
+    ]
     try:
         windows = ProcessorWindows(display, panels, monitors, mountings, clock)
     except NotShared as error:

@@ -13,6 +13,7 @@ from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from runtime.config import PanelSettings
 from runtime.kernels import CURVE_ENTRIES, CURVE_STEPS, ScaleShift, ShownPanel, library
@@ -20,9 +21,9 @@ from runtime.optics.alignment import scale_and_shift
 from runtime.optics.malus import rest_code
 from runtime.optics.relief import displacement
 from runtime.panels import lut
-from runtime.panels.geometry import layer_from_screen, panel_from_screen, permutes_pixels
+from runtime.panels.geometry import layer_from_screen, panel_from_screen
 from runtime.panels.presentation import shows_flat, shows_solved
-from runtime.records import F32, U8, PanelFrame
+from runtime.records import F32, F64, U8, PanelFrame
 
 # Solutions coarser than the panels by this factor are sampled at every other pixel. The pixels between are averages.
 # On the demo scene, this costs 0.02 to 0.2 dB of light.
@@ -54,39 +55,41 @@ class Axis(NamedTuple):
 
 
 class Mounting(NamedTuple):
-    """Mounting of a panel whose monitor shows the layer's pixels, mirrored or turned by quarters."""
+    """How a panel's layer appears on its monitor: mirrored or turned by quarters, and moved by a homography."""
 
-    across: Axis
+    across: Axis  # axes of the turned layer
     down: Axis
+    turned_px: tuple[int, int]  # width and height of the turned layer
+    turned_from_screen: F64 | None  # 3x3 homography from the monitor's pixels, or None if they coincide
 
     @classmethod
-    def of(cls, settings: PanelSettings, *, screen_px: tuple[int, int], layer_px: tuple[int, int]) -> Mounting | None:
-        """Return a panel's mounting, or None if its pictures must be resampled for the monitor.
+    def of(cls, settings: PanelSettings, *, screen_px: tuple[int, int], layer_px: tuple[int, int]) -> Mounting:
+        """Return a panel's mounting.
 
         Args:
             settings: The panel's settings.
             screen_px: The monitor's width and height.
             layer_px: Width and height of each of the stack's panels.
+
+        Raises:
+            ValueError: The homography is singular or not finite.
         """
-        matrix = layer_from_screen(
+        mounted = {"rotation_deg": settings.rotation_deg, "mirror": settings.mirror}
+        layer_from_monitor = layer_from_screen(
             screen_width_px=screen_px[0], screen_height_px=screen_px[1],
             layer_width_px=layer_px[0], layer_height_px=layer_px[1],
-            rotation_deg=settings.rotation_deg, mirror=settings.mirror, homography=settings.homography,
+            homography=settings.homography, **mounted,
         )  # fmt: skip
-        if not permutes_pixels(matrix) or min(screen_px) < 2:
-            return None
-        turn = matrix / matrix[2, 2]
-        unregistered = panel_from_screen(
-            screen_width_px=screen_px[0], screen_height_px=screen_px[1],
-            rotation_deg=settings.rotation_deg, mirror=settings.mirror,
-        )  # fmt: skip
-        if not np.allclose(turn, unregistered, atol=1e-9):  # for example, shifted by a pixel
-            return None
+        turned_px = layer_px[::-1] if settings.rotation_deg in (90, 270) else layer_px
+        turn = panel_from_screen(screen_width_px=turned_px[0], screen_height_px=turned_px[1], **mounted)
         axes = []
         for column in (0, 1):
             layer_axis = int(abs(turn[1, column]) > 0.5)
             axes.append(Axis(layer_axis, round(turn[layer_axis, column]), float(turn[layer_axis, 2])))
-        return cls(*axes)
+        turned: F64 = np.linalg.solve(turn, layer_from_monitor)
+        turned = turned / (turned[2] @ np.array([screen_px[0] / 2, screen_px[1] / 2, 1.0]))  # its sign is arbitrary
+        coincides = turned_px == screen_px and np.allclose(turned, np.eye(3), rtol=0.0, atol=1e-9)
+        return cls(axes[0], axes[1], turned_px, None if coincides else turned)
 
     def on_screen(self, picture: Array) -> Array:
         """Turn a picture, (h, w) or (h, w, 4), from how the viewer sees it to how the monitor shows it."""
@@ -121,7 +124,7 @@ class ProcessorPainter:
             InputError: A grey curve's file cannot be read or is invalid.
         """
         self._mountings, self._screens = mountings, screens
-        self._curves = [_fine_curve(panel) if panel.lut or panel.gamma != 1 else None for panel in panels]
+        self._curves = [_curve_table(panel) if panel.lut or panel.gamma != 1 else None for panel in panels]
         self._solved: _Pictures | None = None
         self._flat: _Pictures | None = None
         self._memory: dict[object, tuple[U8, ...]] = {}  # pictures, reused for layers of the same size
@@ -150,7 +153,10 @@ class ProcessorPainter:
             reliefs: tuple[F32, ...] = ()
             if frame.relief is not None:
                 relief = np.nan_to_num(frame.relief, posinf=0.0, neginf=0.0)
-                reliefs = tuple(np.ascontiguousarray(mounting.on_screen(relief)) for mounting in self._mountings)
+                reliefs = tuple(
+                    _registered(mounting.on_screen(relief), mounting, screen_px=screen.shape[1::-1], reduced=True)
+                    for mounting, screen in zip(self._mountings, self._screens, strict=True)
+                )
             self._solved = _Pictures(frame.solved_version, (width, height), 1 + coarse, pictures, reliefs)
         return self._solved
 
@@ -158,7 +164,13 @@ class ProcessorPainter:
         assert frame.flat is not None
         if self._flat is None or self._flat.version != frame.flat_version:
             size_px = frame.flat.shape[2], frame.flat.shape[1]
-            self._flat = _Pictures(frame.flat_version, size_px, 0, self._prepared(frame.flat, border_px=0))
+            pictures = tuple(
+                _registered(picture, mounting, screen_px=screen.shape[1::-1])
+                for picture, mounting, screen in zip(
+                    self._prepared(frame.flat, border_px=0), self._mountings, self._screens, strict=True
+                )
+            )
+            self._flat = _Pictures(frame.flat_version, size_px, 0, pictures)
         return self._flat
 
     def _prepared(self, layers: U8, *, border_px: int, extended: bool = False) -> tuple[U8, ...]:
@@ -211,10 +223,14 @@ class ProcessorPainter:
         shown.source, shown.source_stride = picture.ctypes.data, picture.strides[0]
         shown.source_rows, shown.source_columns = picture.shape[:2]
         if solved is None:
-            shown.source_from_screen = ScaleShift(1.0, 1.0, -0.5, -0.5)
+            shown.source_from_panel = ScaleShift(1.0, 1.0, -0.5, -0.5)
             return ("flat", source.version), shown
         maps = self._maps(panel, frame, solved)
-        shown.source_from_screen = ScaleShift(*maps[0])
+        shown.source_from_panel = ScaleShift(*maps[0])
+        mounting = self._mountings[panel]
+        if mounting.turned_from_screen is not None:
+            shown.registered, (shown.panel_columns, shown.panel_rows) = 1, mounting.turned_px
+            shown.panel_from_screen[:] = mounting.turned_from_screen.ravel().tolist()
         if maps[1:]:
             relief = solved.reliefs[panel]
             shown.relief, (shown.relief_rows, shown.relief_columns) = relief.ctypes.data, relief.shape
@@ -228,17 +244,20 @@ class ProcessorPainter:
         return (solved.version, *maps, flat.version, frame.flatness), shown
 
     def _maps(self, panel: int, frame: PanelFrame, solved: _Pictures) -> list[tuple[float, float, float, float]]:
-        """Return scales and shifts (scale_u, scale_v, shift_u, shift_v) from a monitor's pixels.
+        """Return scales and shifts (scale_u, scale_v, shift_u, shift_v) from the turned layer's pixels.
 
-        The first leads to positions in the source. If the content's relief displaces them, two follow: to positions in
-        the relief, and to the displacement by a relief of 1. Positions count from the centre of a picture's top left
-        pixel.
+        The first leads to positions in the source. If the content's relief displaces them, two follow: from the
+        monitor's pixels to positions in the relief, and to the displacement by a relief of 1. Positions count from the
+        centre of a picture's top left pixel.
         """
         size_px = frame.size_px or solved.size_px
         aligned = scale_and_shift(frame.solved_from_shown[panel]) if frame.solved_from_shown else (1.0, 1.0, 0.0, 0.0)
         moved = displacement(frame.relief, frame.parallax, panel)
         along: list[list[Line]] = [[], [], []]  # for each map, across and down; plain floats, because arrays are slow
-        for axis in self._mountings[panel]:
+        mounting, screen_px = self._mountings[panel], self._screens[panel].shape[1::-1]
+        for axis, turned_px, pixels in zip(
+            (mounting.across, mounting.down), mounting.turned_px, screen_px, strict=True
+        ):
             to = axis.layer_axis
             coarser = solved.size_px[to] / size_px[to]
             scale, shift = axis.turned((coarser * aligned[to], coarser * aligned[2 + to]), solved.size_px)
@@ -249,16 +268,43 @@ class ProcessorPainter:
             relief_px = moved.relief.shape[1], moved.relief.shape[0]
             share = relief_px[to] / size_px[to]
             scale, shift = axis.turned((share * middle[to], share * middle[2 + to]), relief_px)
-            along[1].append((scale, shift - 0.5))
+            along[1].append((scale * turned_px / pixels, shift - 0.5))
             by = moved.weight * coarser
             at_edge = moved.drift_px[to] + moved.growth * (middle[to] * axis.offset_px + middle[2 + to])
             along[2].append((by * moved.growth * middle[to], axis.sign * by * at_edge))
         return [(across[0], down[0], across[1], down[1]) for across, down in filter(None, along)]
 
 
-def _fine_curve(settings: PanelSettings) -> U8:
-    """Return a panel's grey curve, (3, CURVE_ENTRIES) codes for blue, green and red, by sixteenths of a code."""
+def _registered(picture: Array, mounting: Mounting, *, screen_px: tuple[int, ...], reduced: bool = False) -> Array:
+    """Resample a turned picture for a monitor, if the monitor's pixels do not coincide with the picture's.
+
+    Args:
+        picture: Picture (h, w) or (h, w, 4), of the turned layer's size unless it is reduced.
+        mounting: The panel's mounting.
+        screen_px: The monitor's width and height.
+        reduced: True if the picture is smaller than the layer. It keeps its size, and its edge is repeated outwards.
+    """
+    if mounting.turned_from_screen is None:
+        return np.ascontiguousarray(picture)
+    matrix, size_px, border = mounting.turned_from_screen, tuple(screen_px), cv2.BORDER_CONSTANT
+    if reduced:
+        size_px, border = picture.shape[1::-1], cv2.BORDER_REPLICATE
+        picture_from_turned = np.diag([*np.divide(size_px, mounting.turned_px), 1.0])
+        matrix = picture_from_turned @ matrix @ np.diag([*np.divide(screen_px, size_px), 1.0])
+    middle = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])  # OpenCV counts from pixel centres
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    warped = cv2.warpPerspective(
+        np.ascontiguousarray(picture), np.linalg.inv(middle) @ matrix @ middle, size_px, flags=flags, borderMode=border
+    )
+    return np.asarray(warped, picture.dtype)
+
+
+def _curve_table(settings: PanelSettings) -> NDArray[np.uint32]:
+    """Return a panel's grey curve, (3, CURVE_ENTRIES) pixels, by channel (blue, green, red) and quarters of a code.
+
+    Each pixel has only the channel's byte. The sum of one for each channel is a pixel to display.
+    """
     coarse = lut.curve(lut=settings.lut, gamma=settings.gamma)
     codes = np.arange(CURVE_ENTRIES) / CURVE_STEPS
-    greys = [np.interp(codes, np.arange(lut.ENTRIES), coarse[:, channel]) for channel in (2, 1, 0)]
-    return np.ascontiguousarray(np.rint(255.0 * np.array(greys)), np.uint8)
+    greys = np.array([np.interp(codes, np.arange(lut.ENTRIES), coarse[:, channel]) for channel in (2, 1, 0)])
+    return np.asarray(np.rint(255.0 * greys), np.uint32) << np.array([[0], [8], [16]], np.uint32)

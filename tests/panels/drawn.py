@@ -17,7 +17,13 @@ class DrawnPanels(OffscreenPanels):
     """Offscreen panels whose `read_back` uploads missing layers and draws."""
 
     def __init__(
-        self, context: moderngl.Context, *, clock: Clock, size_px: tuple[int, int], panels: tuple[PanelSettings, ...]
+        self,
+        context: moderngl.Context,
+        *,
+        clock: Clock,
+        size_px: tuple[int, int],
+        panels: tuple[PanelSettings, ...],
+        screen_px: tuple[int, int] | None = None,
     ) -> None:
         super().__init__(clock)
         self._textures = FrameTextures(context, size_px, count=len(panels))
@@ -25,7 +31,7 @@ class DrawnPanels(OffscreenPanels):
         self._painters: list[Painter] = []
         self._targets: list[moderngl.Framebuffer] = []
         for settings in panels:
-            screen = size_px[::-1] if settings.rotation_deg in (90, 270) else size_px
+            screen = screen_px or (size_px[::-1] if settings.rotation_deg in (90, 270) else size_px)
             self._painters.append(Painter(context, settings, screen_px=screen, layer_px=size_px))
             self._targets.append(context.framebuffer([context.texture(screen, 4)]))
 
@@ -70,7 +76,6 @@ class ProcessorDrawnPanels(OffscreenPanels):
         for settings in panels:
             screen = size_px[::-1] if settings.rotation_deg in (90, 270) else size_px
             mounting = Mounting.of(settings, screen_px=screen, layer_px=size_px)
-            assert mounting is not None
             mountings.append(mounting)
             self._screens.append(np.zeros((*screen[::-1], 4), np.uint8))
         self._painter = ProcessorPainter(panels, mountings, self._screens)

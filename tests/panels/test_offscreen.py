@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import moderngl
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from runtime.clock import SimulatedClock
 from runtime.config import PanelSettings
 from runtime.optics.alignment import align, shown_layers
 from runtime.optics.stack import PanelStack
+from runtime.panels.processor import Mounting, ProcessorPainter
 from runtime.records import U8, PanelFrame
 from tests.panels.drawn import DrawnPanels, ProcessorDrawnPanels
 
@@ -74,17 +76,21 @@ def test_a_mounted_panel_s_picture_is_mirrored_then_turned(
     assert np.array_equal(picture, np.rot90(seen, -clockwise_quarters))
 
 
-def test_half_a_pixel_of_registration_is_interpolated(context: moderngl.Context, layers: NDArray[np.uint8]) -> None:
+@BOTH
+def test_half_a_pixel_of_registration_is_interpolated(
+    context: moderngl.Context | None, layers: NDArray[np.uint8]
+) -> None:
+    """With cubic weights by the shader, with linear ones on the processor."""
     shift = ((1.0, 0.0, 0.5), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     (picture,) = shown(context, layers[:1], PanelSettings(homography=shift))
     before, left, right, after = (layers[0, :, k : WIDTH - 3 + k, :3].astype(float) for k in range(4))
     cubic = (19 * (left + right) - 3 * (before + after)) / 32
-    assert np.abs(picture[:, 2:-1] - np.clip(cubic, 0, 255)).max() <= 1.0
+    expected = (left + right) / 2 if context is None else np.clip(cubic, 0, 255)
+    assert np.abs(picture[:, 2:-1] - expected).max() <= 1.0
 
 
-def test_a_perspective_registration_agrees_with_an_independent_warp(context: moderngl.Context) -> None:
-    import cv2
-
+@BOTH
+def test_a_perspective_registration_agrees_with_an_independent_warp(context: moderngl.Context | None) -> None:
     smooth = cv2.GaussianBlur(np.random.default_rng(3).integers(0, 256, (HEIGHT, WIDTH, 4)).astype(np.uint8), (0, 0), 4)
     homography = ((1.02, 0.01, -1.5), (-0.02, 0.97, 1.0), (2e-4, -1e-4, 1.0))
     (picture,) = shown(context, smooth[None], PanelSettings(homography=homography))
@@ -94,9 +100,10 @@ def test_a_perspective_registration_agrees_with_an_independent_warp(context: mod
     assert np.abs(picture[inner].astype(int) - expected[inner][..., :3]).max() <= 2
 
 
+@BOTH
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_horizon_just_beyond_the_panel_darkens_nothing(
-    context: moderngl.Context, layers: NDArray[np.uint8], sign: float
+    context: moderngl.Context | None, layers: NDArray[np.uint8], sign: float
 ) -> None:
     """Below the picture, but nearer than twice its height: what counts is the panel's middle."""
     bent = sign * np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 1 / (1.5 * HEIGHT), 1.0]])
@@ -167,7 +174,8 @@ def test_an_unaligned_panel_is_exact_to_the_bit_beside_aligned_ones(sink: Drawn)
     assert not np.array_equal(codes(sink.read_back())[0], codes(frame.solved)[0])
 
 
-def test_a_registered_panel_is_aligned_first_then_warped_by_its_registration(context: moderngl.Context) -> None:
+@BOTH
+def test_a_registered_panel_is_aligned_first_then_warped_by_its_registration(context: moderngl.Context | None) -> None:
     shift = PanelSettings(homography=((1.0, 0.0, 5.0), (0.0, 1.0, -3.0), (0.0, 0.0, 1.0)))
     sink = offscreen(context, STACK, *(shift,) * 3)
     matrices = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([0.02, 0.016, 0.03])).solved_from_shown
@@ -289,6 +297,59 @@ def test_a_mounted_panel_is_aligned_and_displaced_as_the_viewer_sees_it(
         mirrored = {"none": seen, "horizontal": seen[:, ::-1], "vertical": seen[::-1]}[mirror]
         difference = np.abs(picture[..., :3].astype(int) - np.rot90(mirrored, -rotation_deg // 90)[..., :3])
         assert (difference <= 1).mean() >= 0.999 and difference.max() <= 2
+
+
+BENT = ((1.01, 0.02, 2.3), (-0.015, 0.99, 1.6), (2e-5, -1e-5, 1.0))
+
+
+@pytest.mark.parametrize("rotation_deg", [0, 90, 180, 270])
+@pytest.mark.parametrize("mirror", ["none", "horizontal", "vertical"])
+@pytest.mark.parametrize(("reduction", "flatness"), [(1, 0.3), (3, 0.0)])
+def test_a_registered_panel_is_drawn_alike_by_the_shader_and_the_processor(
+    gl: moderngl.Context, rotation_deg: int, mirror: str, reduction: int, flatness: float
+) -> None:
+    """However it is mounted, for content with relief. Layers are smooth, so that linear weights are like cubic ones."""
+    v, u = np.mgrid[0:40, 0:60] / 8
+    relief = np.asarray(0.1 * np.sin(u) * np.cos(v), np.float32)
+    moved = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([0.02, 0.016, -0.01]))
+    solved, flat = (cv2.GaussianBlur(layers, (0, 0), 9) for layers in (smooth(1)[0], smooth(2)[0]))
+    size_px = STACK.width_px, STACK.height_px
+    frame = PanelFrame(
+        1, np.stack([solved[::reduction, ::reduction]] * 3), 1, moved.solved_from_shown, np.stack([flat] * 3), 1,
+        flatness, size_px, relief, moved.parallax,
+    )  # fmt: skip
+    settings = (PanelSettings(rotation_deg=rotation_deg, mirror=mirror, homography=BENT),) * 3
+    pictures = []
+    for context in (gl, None):
+        sink = offscreen(context, STACK, *settings)
+        sink.present(frame)
+        pictures.append(codes(sink.read_back()))
+        sink.close()
+    shader, processor = pictures
+    difference = np.abs(shader - processor)
+    assert (shader == 0).all(axis=-1).mean() > 0.001  # beyond the layer
+    assert (difference <= 2).mean() >= 0.99  # their edges may differ by a pixel
+
+
+@BOTH
+def test_layers_are_enlarged_for_a_larger_monitor(context: moderngl.Context | None) -> None:
+    size_px, screen_px = (WIDTH, HEIGHT), (2 * WIDTH, 2 * HEIGHT)
+    layer = cv2.GaussianBlur(np.random.default_rng(3).integers(0, 256, (HEIGHT, WIDTH, 4), np.uint8), (0, 0), 4)
+    settings = PanelSettings()
+    if context is None:
+        painter = ProcessorPainter(
+            [settings], [Mounting.of(settings, screen_px=screen_px, layer_px=size_px)],
+            screens := [np.zeros((*screen_px[::-1], 4), np.uint8)],
+        )  # fmt: skip
+        painter.draw(PanelFrame(1, layer[None], 1))
+        picture = screens[0][..., [2, 1, 0]]
+    else:
+        sink = DrawnPanels(context, clock=SimulatedClock(), size_px=size_px, panels=(settings,), screen_px=screen_px)
+        sink.present(PanelFrame(1, layer[None], 1))
+        picture = sink.read_back()[0][..., :3]
+        sink.close()
+    enlarged = cv2.resize(layer, screen_px, interpolation=cv2.INTER_LINEAR)[..., :3]
+    assert np.abs(picture.astype(int) - enlarged)[2:-2, 2:-2].max() <= 2
 
 
 def test_on_the_processor_only_panels_that_change_are_drawn() -> None:

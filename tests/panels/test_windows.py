@@ -197,14 +197,13 @@ def test_a_frame_drawn_early_is_shown_when_it_is_due(opened: Callable[..., Any])
 
 
 @PROCESSOR
-@pytest.mark.parametrize("bent", [((1.0, 0.01, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
-                                  ((1.0, 0.0, 5.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))])  # fmt: skip
-def test_a_registered_panel_is_drawn_by_opengl(
-    opened: Callable[..., Any], caplog: pytest.LogCaptureFixture, bent: Any
-) -> None:
-    sink = opened(PanelSettings(connector="DUMMY2", homography=bent), *BY_CONNECTOR[1:])
-    assert presents(sink, 0)
-    assert "panel 0 must be resampled by OpenGL" in caplog.text
+def test_a_registered_panel_is_drawn_on_the_processor_too(opened: Callable[..., Any], x: XServer) -> None:
+    shift = ((1.0, 0.0, 5.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    sink = opened(PanelSettings(connector="DUMMY2", homography=shift), *BY_CONNECTOR[1:])
+    sink.present(frame(7))
+    expected = np.roll(picture(7, 0), 5, axis=1)
+    expected[:, :5] = 0
+    assert shows(x, 2, expected)
 
 
 @pytest.mark.skipif(os.getuid() != 0 or shutil.which("unshare") is None, reason="needs root and unshare")
