@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -74,7 +74,7 @@ class Mounting(NamedTuple):
         Raises:
             ValueError: The homography is singular or not finite.
         """
-        mounted = {"rotation_deg": settings.rotation_deg, "mirror": settings.mirror}
+        mounted: dict[str, Any] = {"rotation_deg": settings.rotation_deg, "mirror": settings.mirror}
         layer_from_monitor = layer_from_screen(
             screen_width_px=screen_px[0], screen_height_px=screen_px[1],
             layer_width_px=layer_px[0], layer_height_px=layer_px[1],
@@ -86,8 +86,8 @@ class Mounting(NamedTuple):
         for column in (0, 1):
             layer_axis = int(abs(turn[1, column]) > 0.5)
             axes.append(Axis(layer_axis, round(turn[layer_axis, column]), float(turn[layer_axis, 2])))
-        turned: F64 = np.linalg.solve(turn, layer_from_monitor)
-        turned = turned / (turned[2] @ np.array([screen_px[0] / 2, screen_px[1] / 2, 1.0]))  # its sign is arbitrary
+        turned = np.asarray(np.linalg.solve(turn, layer_from_monitor), np.float64)
+        turned /= turned[2] @ np.array([screen_px[0] / 2, screen_px[1] / 2, 1.0])  # its sign is arbitrary
         coincides = turned_px == screen_px and np.allclose(turned, np.eye(3), rtol=0.0, atol=1e-9)
         return cls(axes[0], axes[1], turned_px, None if coincides else turned)
 
@@ -154,7 +154,7 @@ class ProcessorPainter:
             if frame.relief is not None:
                 relief = np.nan_to_num(frame.relief, posinf=0.0, neginf=0.0)
                 reliefs = tuple(
-                    _registered(mounting.on_screen(relief), mounting, screen_px=screen.shape[1::-1], reduced=True)
+                    _registered(mounting.on_screen(relief), mounting, screen_px=_size_px(screen), reduced=True)
                     for mounting, screen in zip(self._mountings, self._screens, strict=True)
                 )
             self._solved = _Pictures(frame.solved_version, (width, height), 1 + coarse, pictures, reliefs)
@@ -165,7 +165,7 @@ class ProcessorPainter:
         if self._flat is None or self._flat.version != frame.flat_version:
             size_px = frame.flat.shape[2], frame.flat.shape[1]
             pictures = tuple(
-                _registered(picture, mounting, screen_px=screen.shape[1::-1])
+                _registered(picture, mounting, screen_px=_size_px(screen))
                 for picture, mounting, screen in zip(
                     self._prepared(frame.flat, border_px=0), self._mountings, self._screens, strict=True
                 )
@@ -254,10 +254,8 @@ class ProcessorPainter:
         aligned = scale_and_shift(frame.solved_from_shown[panel]) if frame.solved_from_shown else (1.0, 1.0, 0.0, 0.0)
         moved = displacement(frame.relief, frame.parallax, panel)
         along: list[list[Line]] = [[], [], []]  # for each map, across and down; plain floats, because arrays are slow
-        mounting, screen_px = self._mountings[panel], self._screens[panel].shape[1::-1]
-        for axis, turned_px, pixels in zip(
-            (mounting.across, mounting.down), mounting.turned_px, screen_px, strict=True
-        ):
+        mounting, screen_px = self._mountings[panel], _size_px(self._screens[panel])
+        for n, axis in enumerate((mounting.across, mounting.down)):
             to = axis.layer_axis
             coarser = solved.size_px[to] / size_px[to]
             scale, shift = axis.turned((coarser * aligned[to], coarser * aligned[2 + to]), solved.size_px)
@@ -268,14 +266,19 @@ class ProcessorPainter:
             relief_px = moved.relief.shape[1], moved.relief.shape[0]
             share = relief_px[to] / size_px[to]
             scale, shift = axis.turned((share * middle[to], share * middle[2 + to]), relief_px)
-            along[1].append((scale * turned_px / pixels, shift - 0.5))
+            along[1].append((scale * mounting.turned_px[n] / screen_px[n], shift - 0.5))
             by = moved.weight * coarser
             at_edge = moved.drift_px[to] + moved.growth * (middle[to] * axis.offset_px + middle[2 + to])
             along[2].append((by * moved.growth * middle[to], axis.sign * by * at_edge))
         return [(across[0], down[0], across[1], down[1]) for across, down in filter(None, along)]
 
 
-def _registered(picture: Array, mounting: Mounting, *, screen_px: tuple[int, ...], reduced: bool = False) -> Array:
+def _size_px(picture: U8 | F32) -> tuple[int, int]:
+    """Return a picture's width and height."""
+    return picture.shape[1], picture.shape[0]
+
+
+def _registered(picture: Array, mounting: Mounting, *, screen_px: tuple[int, int], reduced: bool = False) -> Array:
     """Resample a turned picture for a monitor, if the monitor's pixels do not coincide with the picture's.
 
     Args:
@@ -286,16 +289,16 @@ def _registered(picture: Array, mounting: Mounting, *, screen_px: tuple[int, ...
     """
     if mounting.turned_from_screen is None:
         return np.ascontiguousarray(picture)
-    matrix, size_px, border = mounting.turned_from_screen, tuple(screen_px), cv2.BORDER_CONSTANT
+    matrix, (width, height), border = mounting.turned_from_screen, screen_px, cv2.BORDER_CONSTANT
     if reduced:
-        size_px, border = picture.shape[1::-1], cv2.BORDER_REPLICATE
-        picture_from_turned = np.diag([*np.divide(size_px, mounting.turned_px), 1.0])
-        matrix = picture_from_turned @ matrix @ np.diag([*np.divide(screen_px, size_px), 1.0])
+        (width, height), border = _size_px(picture), cv2.BORDER_REPLICATE
+        reduced_from_turned = np.diag(np.array([width / mounting.turned_px[0], height / mounting.turned_px[1], 1.0]))
+        screen_from_reduced = np.diag(np.array([screen_px[0] / width, screen_px[1] / height, 1.0]))
+        matrix = reduced_from_turned @ matrix @ screen_from_reduced
     middle = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])  # OpenCV counts from pixel centres
+    matrix, picture = np.linalg.inv(middle) @ matrix @ middle, np.ascontiguousarray(picture)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    warped = cv2.warpPerspective(
-        np.ascontiguousarray(picture), np.linalg.inv(middle) @ matrix @ middle, size_px, flags=flags, borderMode=border
-    )
+    warped = cv2.warpPerspective(picture, matrix, (width, height), flags=flags, borderMode=border)
     return np.asarray(warped, picture.dtype)
 
 
