@@ -1,6 +1,6 @@
 // Draw the panels' pictures on the processor (runtime/panels/processor.py): sample a layer, which may be coarse and
 // displaced by the content's relief, mix it with the flat picture and apply the panel's grey curve. Pixels have four
-// bytes. Positions in pictures count from the centre of the top left pixel, positions on the screen and the panel from
+// bytes, in the order RGBA in pictures and BGRX on the screen. Positions in pictures count from the centre of the top left pixel, positions on the screen and the panel from
 // their corners. The panel's pixels are turned like the screen's, and coincide with them unless a homography is given.
 #include <pthread.h>
 #include <sched.h>
@@ -28,7 +28,7 @@ struct Shown {
   int64_t screen_stride;
   const uint8_t *flat;  // picture of the screen's size to mix in, or null
   int64_t flat_stride;
-  const uint32_t *curve;  // (3, CURVE) pixels with one byte each: a pixel's bytes as grey levels; or null
+  const uint32_t *curve;  // (3, CURVE) the screen's pixels with one byte each, blue, green and red; or null
   const float *relief;   // (relief_rows, relief_columns), or null
   int32_t source_rows, source_columns, rows, columns, relief_rows, relief_columns, panel_rows, panel_columns;
   ScaleShift source_from_panel, relief_from_screen;
@@ -107,6 +107,8 @@ INLINE const float *relief_row(const Shown &shown, Relief &kept, int row) {
   return relief;
 }
 
+INLINE uint32_t rotated(uint32_t word) { return word << 16 | word >> 16; }
+
 // Copy a row whose pixels coincide with the source's. Return false if the row must be drawn instead.
 INLINE bool copied(const Shown &shown, int r) {
   const ScaleShift &at = shown.source_from_panel;
@@ -114,8 +116,10 @@ INLINE bool copied(const Shown &shown, int r) {
   if (shown.registered || shown.relief || shown.flat || shown.curve || at.scale_u != 1 || at.scale_v != 1) return false;
   if (u != std::floor(u) || v != std::floor(v) || u < 0 || v < 0) return false;
   if (int(u) + shown.columns > shown.source_columns || int(v) >= shown.source_rows) return false;
-  const uint8_t *from = shown.source + int64_t(v) * shown.source_stride + int64_t(u) * 4;
-  std::memcpy(shown.screen + r * shown.screen_stride, from, size_t(shown.columns) * 4);
+  const auto *from = reinterpret_cast<const Word *>(shown.source + int64_t(v) * shown.source_stride + int64_t(u) * 4);
+  auto *pixels = reinterpret_cast<Word *>(shown.screen + r * shown.screen_stride);
+  VECTORISED for (int c = 0; c < shown.columns; ++c)
+    pixels[c] = (from[c] & 0xFF00FF00u) | (rotated(from[c]) & 0x00FF00FFu);
   return true;
 }
 
@@ -211,6 +215,8 @@ INLINE int16_t entry_of(int16_t value) {
 INLINE void store(const Shown &shown, uint8_t *screen, int count, Block &block) {
   if (!shown.curve) {
     auto *pairs = reinterpret_cast<Pair *>(screen);
+    auto *red_and_blue = reinterpret_cast<Word *>(block.even);
+    VECTORISED for (int k = 0; k < count; ++k) red_and_blue[k] = rotated(red_and_blue[k]);
     VECTORISED for (int k = 0; k < 2 * count; ++k) pairs[k] = pair_of(block.even[k], block.odd[k]);
     return;
   }
@@ -219,7 +225,7 @@ INLINE void store(const Shown &shown, uint8_t *screen, int count, Block &block) 
   auto *pixels = reinterpret_cast<Word *>(screen);
   const uint32_t *blue = shown.curve, *green = blue + CURVE, *red = green + CURVE;
   for (int k = 0; k < count; ++k)
-    pixels[k] = blue[block.even[2 * k]] | green[block.odd[2 * k]] | red[block.even[2 * k + 1]];
+    pixels[k] = blue[block.even[2 * k + 1]] | green[block.odd[2 * k]] | red[block.even[2 * k]];
 }
 
 INLINE void draw_row(const Shown &shown, int r, uint8_t *screen, Relief &kept, Block &block) {

@@ -57,7 +57,6 @@ def _libraries() -> tuple[ctypes.CDLL, ctypes.CDLL, ctypes.CDLL]:
     x11.XCreateGC.restype, x11.XCreateGC.argtypes = c_void_p, [c_void_p, c_ulong, c_ulong, c_void_p]
     x11.XFreeGC.argtypes = [c_void_p, c_void_p]
     x11.XSync.argtypes = [c_void_p, c_int]
-    x11.XFlush.argtypes = [c_void_p]
     x11.XFree.argtypes = [c_void_p]
     x11.XCreatePixmap.restype, x11.XCreatePixmap.argtypes = c_ulong, [c_void_p, c_ulong, c_uint, c_uint, c_uint]
     x11.XFreePixmap.argtypes = [c_void_p, c_ulong]
@@ -70,14 +69,26 @@ def _libraries() -> tuple[ctypes.CDLL, ctypes.CDLL, ctypes.CDLL]:
         c_void_p, POINTER(_Visual), c_uint, c_int, c_char_p, POINTER(_Segment), c_uint, c_uint,
     ]  # fmt: skip
     extensions.XShmAttach.argtypes = extensions.XShmDetach.argtypes = [c_void_p, POINTER(_Segment)]
-    extensions.XShmPutImage.argtypes = [
-        c_void_p, c_ulong, c_void_p, POINTER(_Image), c_int, c_int, c_int, c_int, c_uint, c_uint, c_int,
-    ]  # fmt: skip
     system.shmget.argtypes = [c_int, ctypes.c_size_t, c_int]
     system.shmat.restype, system.shmat.argtypes = c_void_p, [c_int, c_void_p, c_int]
     system.shmdt.argtypes = [c_void_p]
     system.shmctl.argtypes = [c_int, c_int, c_void_p]
     return x11, extensions, system
+
+
+@functools.cache
+def _short_calls() -> tuple[ctypes.PyDLL, ctypes.PyDLL]:
+    """Return the libraries of functions that only write to the connection.
+
+    They keep Python's global lock, because taking it again may take milliseconds: the solver's thread, which has a lower
+    priority, may lose its processor while it has the lock.
+    """
+    x11, extensions = ctypes.PyDLL("libX11.so.6"), ctypes.PyDLL("libXext.so.6")
+    x11.XFlush.argtypes = [c_void_p]
+    extensions.XShmPutImage.argtypes = [
+        c_void_p, c_ulong, c_void_p, POINTER(_Image), c_int, c_int, c_int, c_int, c_uint, c_uint, c_int,
+    ]  # fmt: skip
+    return x11, extensions
 
 
 class SharedPicture:
@@ -109,7 +120,7 @@ class SharedPicture:
     def put(self) -> None:
         """Ask the X server to copy the picture to its window. `finish` waits for it."""
         size = self._image.contents.width, self._image.contents.height
-        _libraries()[1].XShmPutImage(self._display, self._window, self._context, self._image, 0, 0, 0, 0, *size, 0)
+        _short_calls()[1].XShmPutImage(self._display, self._window, self._context, self._image, 0, 0, 0, 0, *size, 0)
 
     def close(self) -> None:
         """Release the memory. May be called more than once. `pixels` must not be used afterwards."""
@@ -159,13 +170,13 @@ class SharedPicture:
             self._attached = False
             raise NotShared("the X server cannot reach this process's memory")
         self._context = x11.XCreateGC(self._display, self._window, 0, None)
-        if self._pixel_read_back(x11, extensions) != ctypes.c_uint32.from_address(address).value:
+        if self._pixel_read_back(x11) != ctypes.c_uint32.from_address(address).value:
             raise NotShared("the X server cannot reach this process's memory")
         content = (ctypes.c_uint8 * (image.stride * height_px)).from_address(address)
         self.pixels: U8 = np.frombuffer(content, np.uint8).reshape(height_px, width_px, 4)  # BGRX
         self.pixels[:] = 0
 
-    def _pixel_read_back(self, x11: ctypes.CDLL, extensions: ctypes.CDLL) -> int | None:
+    def _pixel_read_back(self, x11: ctypes.CDLL) -> int | None:
         """Return the value that the X server finds in the first pixel, after setting it to a random value.
 
         A server in another IPC namespace may have attached a different segment, which has the same number there.
@@ -173,7 +184,7 @@ class SharedPicture:
         depth = self._image.contents.depth
         ctypes.c_uint32.from_address(self._segment.address).value = int.from_bytes(os.urandom(3), "little")
         pixmap = x11.XCreatePixmap(self._display, self._window, 1, 1, depth)
-        extensions.XShmPutImage(self._display, pixmap, self._context, self._image, 0, 0, 0, 0, 1, 1, 0)
+        _short_calls()[1].XShmPutImage(self._display, pixmap, self._context, self._image, 0, 0, 0, 0, 1, 1, 0)
         copy = x11.XGetImage(self._display, pixmap, 0, 0, 1, 1, ALL_PLANES, Z_PIXMAP)
         x11.XFreePixmap(self._display, pixmap)
         if not copy:
@@ -198,4 +209,4 @@ def flush(display: int) -> None:
     Args:
         display: Pointer to an open Xlib `Display`.
     """
-    _libraries()[0].XFlush(display)
+    _short_calls()[0].XFlush(display)
