@@ -1,4 +1,4 @@
-"""Compiled C++ loops, called through `ctypes`. The GIL is released during each call.
+"""Compiled C++ loops, called through `ctypes`. The GIL is released during each call, except by `frame_picture`.
 
 The structures in this module mirror those in the C++ files field by field. In C++, `KernelImage` is called `Image`,
 `KernelView` is called `View`, and `ErrorSum` is called `Result`. `library` checks that the structure sizes and the
@@ -154,6 +154,10 @@ def library() -> Any:
         if function is None:
             raise other
         function.argtypes, function.restype = arguments, None
+    short = ctypes.PyDLL(str(built))  # keeps the GIL, because the presenter could wait for it longer than it takes
+    loops.frame_picture = short.frame_picture
+    loops.frame_picture.argtypes = [_pointer, _long, _long, _int, _int, _pointer, _int, _int]
+    loops.frame_picture.restype = None
     for name, value in COMPILED.items():
         try:
             compiled = _int.in_dll(loops, name).value

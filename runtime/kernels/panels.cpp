@@ -368,6 +368,25 @@ bool start(pthread_t &thread, Part &part) {
 
 }  // namespace
 
+// Copy a turned picture into the middle of one that has a border. The turned picture's next row and next column are
+// `row_step` and `column_step` bytes away.
+extern "C" void frame_picture(const uint8_t *turned, int64_t row_step, int64_t column_step, int rows, int columns, uint8_t *framed, int border_px, int extended) {
+  const int width = columns + 2 * border_px;
+  auto *middle = reinterpret_cast<Word *>(framed) + border_px * (width + 1);
+  for (int r = 0; r < rows; ++r) {
+    const uint8_t *from = turned + r * row_step;
+    Word *to = middle + int64_t(r) * width;
+    if (column_step == 4) std::memcpy(to, from, size_t(columns) * 4);
+    else
+      for (int c = 0; c < columns; ++c) to[c] = *reinterpret_cast<const Word *>(from + c * column_step);
+    if (extended) to[-1] = to[0], to[columns] = to[columns - 1];
+  }
+  if (!extended) return;
+  Word *last = middle + int64_t(rows - 1) * width;
+  std::memcpy(middle - width - 1, middle - 1, size_t(columns + 2) * 4);
+  std::memcpy(last + width - 1, last - 1, size_t(columns + 2) * 4);
+}
+
 // Draw pictures on several threads with the caller's priority. Each thread draws the same share of every picture's rows.
 extern "C" void draw_panels(const Shown *shown, int count, int threads) {
   const int parts = std::clamp(threads, 1, MAX_THREADS);

@@ -45,7 +45,8 @@ def block_px(width_px: int) -> int:
 def relief_of(nearness: Sequence[F32], *, distance_m: Sequence[float], rim_px: int = RIM_PX) -> F32:
     """Combine the depth seen by the two eyes into one (h, w) relief.
 
-    Each pixel takes whichever eye's relief has the larger magnitude. The background has relief 0.
+    Each pixel takes whichever eye's relief has the larger magnitude. The background has relief 0, and so have pixels
+    whose distance is not a finite number.
 
     Args:
         nearness: For each eye, the (h, w) inverse distances from the eye along x, in 1/m. The background is 0.
@@ -58,7 +59,8 @@ def relief_of(nearness: Sequence[F32], *, distance_m: Sequence[float], rim_px: i
         kept = cv2.dilate(inverse, rim)
         reliefs.append(np.where(kept > 0.0, kept * np.float32(eye_m) - np.float32(1), np.float32(0)))
     left, right = reliefs
-    return np.ascontiguousarray(np.where(np.abs(left) > np.abs(right), left, right), np.float32)
+    larger = np.where(np.abs(left) > np.abs(right), left, right)
+    return np.ascontiguousarray(np.where(np.isfinite(larger), larger, 0.0), np.float32)
 
 
 def parallax(stack: PanelStack, *, old_m: F64, new_m: F64) -> Parallax | None:

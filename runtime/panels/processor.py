@@ -157,9 +157,8 @@ class ProcessorPainter:
             pictures = self._prepared(frame.solved, border_px=2 if coarse else 1, extended=coarse)
             reliefs: tuple[F32, ...] = ()
             if frame.relief is not None:
-                relief = np.nan_to_num(frame.relief, posinf=0.0, neginf=0.0)
                 reliefs = tuple(
-                    _registered(mounting.on_screen(relief), mounting, screen_px=_size_px(screen), reduced=True)
+                    _registered(mounting.on_screen(frame.relief), mounting, screen_px=_size_px(screen), reduced=True)
                     for mounting, screen in zip(self._mountings, self._screens, strict=True)
                 )
             self._solved = _Pictures(frame.solved_version, (width, height), 1 + coarse, pictures, reliefs)
@@ -188,23 +187,18 @@ class ProcessorPainter:
             border_px: Width of the border.
             extended: True to repeat the layers' edge pixels in the innermost pixel of the border.
         """
-        mounted = zip(layers, self._mountings, strict=True)
-        turned = [mounting.on_screen(layer) for layer, mounting in mounted]
+        turned = [mounting.on_screen(layer) for layer, mounting in zip(layers, self._mountings, strict=True)]
         key = layers.shape, border_px
         if key not in self._memory:
             rest = min(rest_code(len(layers)), 255)
-            self._memory[key] = tuple(
-                np.pad(picture, ((border_px,) * 2, (border_px,) * 2, (0, 0)), constant_values=rest)
-                for picture in turned
-            )
+            border = (border_px,) * 2, (border_px,) * 2, (0, 0)
+            self._memory[key] = tuple(np.pad(picture, border, constant_values=rest) for picture in turned)
         pictures = self._memory[key]
         for picture, layer in zip(pictures, turned, strict=True):
-            height, width = layer.shape[:2]
-            picture[border_px : border_px + height, border_px : border_px + width] = layer
-            if extended:
-                inner = picture[border_px - 1 : border_px + height + 1, border_px - 1 : border_px + width + 1]
-                inner[0, 1:-1], inner[-1, 1:-1] = inner[1, 1:-1], inner[-2, 1:-1]
-                inner[:, 0], inner[:, -1] = inner[:, 1], inner[:, -2]
+            rows, columns = layer.shape[:2]
+            library().frame_picture(
+                layer.ctypes.data, *layer.strides[:2], rows, columns, picture.ctypes.data, border_px, extended
+            )
         return pictures
 
     def _shown(

@@ -79,6 +79,14 @@ def test_nearer_content_extends_by_a_rim() -> None:
     np.testing.assert_allclose(relief, expected, atol=1e-6)
 
 
+def test_distances_that_are_not_numbers_have_no_relief() -> None:
+    nearness = np.full((6, 30), 2.0, np.float32)
+    nearness[:, 10:20], nearness[:, 20:] = np.inf, np.nan
+    relief = relief_of((nearness, nearness), distance_m=(0.6, 0.6))
+    assert np.isfinite(relief).all()
+    assert relief[0, 0] == pytest.approx(0.2) and not relief[:, 12:].any()
+
+
 def test_without_a_movement_or_a_middle_panel_nothing_is_displaced() -> None:
     middle = EYES_M.mean(axis=0)
     assert parallax(STACK, old_m=middle, new_m=middle) is None

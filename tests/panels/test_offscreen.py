@@ -364,16 +364,6 @@ def test_on_the_processor_only_panels_that_change_are_drawn() -> None:
     assert sink.drawn(PanelFrame(4, smooth(2), 2, moved.solved_from_shown)) == [0, 1, 2]
 
 
-def test_a_relief_that_is_not_a_number_harms_nothing() -> None:
-    relief = np.full((20, 30), np.nan, np.float32)
-    relief[:10] = np.inf
-    moved = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([0.0, 0.016, 0.0]))
-    sink = ProcessorDrawnPanels(
-        clock=SimulatedClock(), size_px=(STACK.width_px, STACK.height_px), panels=(PanelSettings(),) * 3
-    )
-    sink.drawn(PanelFrame(1, smooth(1), 1, moved.solved_from_shown, relief=relief, parallax=moved.parallax))
-
-
 @pytest.mark.parametrize("size_px", [(480, 320), (477, 319)])
 @pytest.mark.parametrize("gamma", [1.0, 2.0])
 def test_on_the_processor_pixels_between_those_of_a_coarse_solution_are_averages(
