@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from runtime.config import PanelSettings
 from runtime.kernels import CURVE_ENTRIES, CURVE_STEPS, ScaleShift, ShownPanel, library
-from runtime.optics.alignment import scale_and_shift
+from runtime.optics.alignment import is_identity, scale_and_shift
 from runtime.optics.malus import rest_code
 from runtime.optics.relief import displacement
 from runtime.panels import lut
@@ -30,9 +30,9 @@ from runtime.panels.geometry import layer_from_screen, panel_from_screen
 from runtime.panels.presentation import shows_flat, shows_solved
 from runtime.records import F32, F64, U8, PanelFrame
 
-# Solutions coarser than the panels by this factor are sampled at every other pixel. The pixels between are averages.
-# On the demo scene, this costs 0.02 to 0.2 dB of light.
-COARSE = 2.5
+# If solutions coarser than the panels by this factor are moved by the alignment, they are sampled at every other pixel.
+# The pixels between are averages. On the demo scene, this costs 0.05 to 0.3 dB of light.
+COARSE = 1.5
 MOST_THREADS = 4  # more threads would be limited by the memory
 Array = TypeVar("Array", U8, F32)
 
@@ -234,7 +234,8 @@ class ProcessorPainter:
             shown.relief, (shown.relief_rows, shown.relief_columns) = relief.ctypes.data, relief.shape
             shown.relief_from_screen, shown.push = ScaleShift(*maps[1]), ScaleShift(*maps[2])
         if flat is None:
-            if (frame.size_px or solved.size_px)[0] >= COARSE * solved.size_px[0]:
+            coarse = (frame.size_px or solved.size_px)[0] >= COARSE * solved.size_px[0]
+            if coarse and not all(map(is_identity, frame.solved_from_shown)):
                 shown.every = 2
             return (solved.version, *maps), shown
         other = flat.pictures[panel]
