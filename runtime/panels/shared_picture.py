@@ -80,8 +80,8 @@ def _libraries() -> tuple[ctypes.CDLL, ctypes.CDLL, ctypes.CDLL]:
 def _short_calls() -> tuple[ctypes.PyDLL, ctypes.PyDLL]:
     """Return the libraries of functions that only write to the connection.
 
-    They keep Python's global lock, because taking it again may take milliseconds: the solver's thread, which has a lower
-    priority, may lose its processor while it has the lock.
+    They keep Python's global lock. Taking it again could take milliseconds, because the solver's thread, which has a
+    lower priority, may lose its processor while it has the lock.
     """
     x11, extensions = ctypes.PyDLL("libX11.so.6"), ctypes.PyDLL("libXext.so.6")
     x11.XFlush.argtypes = [c_void_p]
