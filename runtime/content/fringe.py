@@ -100,7 +100,7 @@ class OutlineRamps:
         Returns:
             Ramps (m, 4, CORNER_FLOATS), valid until the next call, and how many of them each part has. Each ramp has
             two corners on its edge and then two outside the outline. A corner consists of clip coordinates (4),
-            coverage, and the attributes (9) of the edge's vertex that it is at or beside. `TRIANGLES` states which
+            coverage, and the attributes (9) of the edge's vertex nearest to it. `TRIANGLES` states which
             corners form a ramp's two triangles.
         """
         order, counts = (

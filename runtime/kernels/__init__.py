@@ -139,7 +139,7 @@ def library() -> Any:
     built = Path(__file__).with_name("compiled" + EXTENSION_SUFFIXES[0])  # a build for another Python may be outdated
     if not built.exists():
         raise ImportError(f"runtime.kernels is not compiled for this Python: {_AGAIN}")
-    loops = ctypes.CDLL(str(built))
+    loops: Any = ctypes.CDLL(str(built))
     other = ImportError(f"{built} was built from another version: {_AGAIN}")
     for name, arguments in {
         "step": (_pointer, _int, _int),
