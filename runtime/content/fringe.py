@@ -69,7 +69,10 @@ def edges_of(shape: Shape) -> Edges:
 
 
 class OutlineRamps:
-    """Builds ramps along the outlines of parts: quadrilaterals whose coverage falls from 1 at the edge to 0 outside."""
+    """Builds ramps along the outlines of parts.
+
+    A ramp is a quadrilateral whose coverage falls from 1 at the edge to 0 outside the outline.
+    """
 
     def __init__(self, parts: Mapping[int, tuple[Edges, F32]]) -> None:
         """Prepare to build ramps.

@@ -1,4 +1,6 @@
-"""Compiled C++ loops, called through `ctypes`. The GIL is released during each call, except by `frame_picture`.
+"""Compiled C++ loops, called through `ctypes`.
+
+The GIL is released during each call, except by `frame_picture`.
 
 The structures in this module mirror those in the C++ files field by field. In C++, `KernelImage` is called `Image`,
 `KernelView` is called `View`, and `ErrorSum` is called `Result`. `library` checks that the structure sizes and the

@@ -60,7 +60,7 @@ class Axis(NamedTuple):
 
 
 class Mounting(NamedTuple):
-    """Position of a panel's layer on its monitor: mirrored, turned by quarters, and moved by a homography."""
+    """Position of a panel's layer on its monitor: mirrored, turned, and moved by a homography."""
 
     across: Axis  # axes of the turned layer
     down: Axis
