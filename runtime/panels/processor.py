@@ -5,8 +5,8 @@ follow `runtime.optics.alignment.shown_layers`. The pictures are equal to within
 solutions and of panels with a homography. The latter are interpolated linearly here, where the shader uses cubic
 weights, which are 0.15 dB better.
 
-This runs on the presenter's thread. It leaves no work to the thread pools of NumPy and OpenCV, whose threads have a
-lower priority.
+This runs on the presenter's thread. At a refresh, it leaves no work to OpenCV's threads, which have a lower priority,
+and takes Python's global lock as rarely as possible.
 """
 
 from __future__ import annotations
