@@ -12,7 +12,7 @@ from runtime.records import F64
 NEAREST_M = 1e-3  # distance from the eye to the near plane
 
 
-def clip_from_stack(view: View, corners_m: F64) -> F64:
+def clip_from_stack(view: View, *, near_m: float, far_m: float) -> F64:
     """Return the 4x4 OpenGL clip matrix for a view.
 
     The raster's v axis is mapped to +y in OpenGL, which stores the bottom row first. Row 0 of the raster is therefore
@@ -20,12 +20,12 @@ def clip_from_stack(view: View, corners_m: F64) -> F64:
 
     Args:
         view: View whose projection to convert.
-        corners_m: Corners (8n, 3) of n boxes in frame `stack`. The near and far planes are chosen to enclose them.
+        near_m: Distance of the near plane (`depth_bounds`).
+        far_m: Distance of the far plane.
 
     Raises:
-        ValueError: No corner is in front of the eye.
+        ValueError: Nothing is in front of the eye.
     """
-    near_m, far_m = depth_bounds(view, corners_m)
     if not 0.0 < near_m < far_m:
         raise ValueError(
             f"near {near_m} and far {far_m} are not valid clipping distances; far must be greater than near"

@@ -7,14 +7,13 @@ hundred edges. Each ramp is one pixel wide, so objects are enlarged by half a pi
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from ctypes import byref
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runtime.content.shapes import I32, Shape, welded
-from runtime.kernels import OutlinedPart, Raster, library
+from runtime.kernels import OutlinedPart, library
 from runtime.records import F32, F64
 
 CORNER_FLOATS = 5 + 9  # clip coordinates and coverage (5), attributes (9)
@@ -113,10 +112,10 @@ class OutlineRamps:
         for n, (_, eye, clip_from_part) in zip(order.tolist(), seen, strict=True):
             self._parts[n].eye[:] = eye.tolist()
             self._parts[n].clip_from_part[:] = clip_from_part.ravel().tolist()
-        raster = Raster(width_px, height_px, ramp_px)
         library().outline_ramps(
-            self._parts, order.ctypes.data, len(seen), byref(raster), self._ramps.ctypes.data, counts.ctypes.data
-        )
+            self._parts, order.ctypes.data, len(seen), width_px, height_px, ramp_px,
+            self._ramps.ctypes.data, counts.ctypes.data,
+        )  # fmt: skip
         return self._ramps[: counts.sum()], counts.tolist()
 
 

@@ -330,7 +330,8 @@ class TriangleSource(CanvasSource):
         area = camera.covered_box(view, corners_m)
 
         def paint() -> None:
-            clip = camera.clip_from_stack(view, corners_m)
+            near_m, far_m = self._bounds[view.side] = camera.depth_bounds(view, corners_m)
+            clip = camera.clip_from_stack(view, near_m=near_m, far_m=far_m)
             shared = {id(place): _Look(place, clip, view) for place in arranged.places}
             looks = [shared[id(place)] for place in arranged.places]
             placed = [(self.parts[n], looks[n]) for n in arranged.nearest_first]
@@ -351,10 +352,7 @@ class TriangleSource(CanvasSource):
             if any(part.is_blended for part in self.parts):
                 self._draw_translucent(placed)
 
-        picture = self.drawn(view, area, paint)
-        if area.width_px and area.height_px:
-            self._bounds[view.side] = camera.depth_bounds(view, corners_m)
-        return picture
+        return self.drawn(view, area, paint)
 
     def _draw_translucent(self, placed: list[tuple[DrawnPart, _Look]]) -> None:
         """Blend translucent parts over opaque parts, farthest first.

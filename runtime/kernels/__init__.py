@@ -123,12 +123,6 @@ class OutlinedPart(ctypes.Structure):
     )  # fmt: skip
 
 
-class Raster(ctypes.Structure):
-    """Size of the raster that ramps are drawn on, and their width."""
-
-    _fields_ = (("width_px", _double), ("height_px", _double), ("ramp_px", _double))
-
-
 COMPILED = {
     "problem_bytes": ctypes.sizeof(Problem), "warp_bytes": ctypes.sizeof(Warp), "view_bytes": ctypes.sizeof(KernelView),
     "shown_bytes": ctypes.sizeof(ShownPanel), "outlined_part_bytes": ctypes.sizeof(OutlinedPart), "max_sets": MAX_SETS,
@@ -150,7 +144,7 @@ def library() -> Any:
         "warp": (_pointer, _pointer, _pointer, _int, _int, _int, _int),
         "squared_error": (_pointer, _int, _int, _pointer),
         "draw_panels": (_pointer, _int, _int),
-        "outline_ramps": (_pointer, _pointer, _int, _pointer, _pointer, _pointer),
+        "outline_ramps": (_pointer, _pointer, _int, _double, _double, _double, _pointer, _pointer),
     }.items():
         function = getattr(loops, name, None)
         if function is None:

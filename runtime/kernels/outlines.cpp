@@ -21,10 +21,6 @@ struct OutlinedPart {
   double eye[3], clip_from_part[16];
 };
 
-struct Raster {
-  double width_px, height_px, ramp_px;
-};
-
 struct Clip {
   double x, y, z, w;
 };
@@ -41,22 +37,21 @@ INLINE void write_corner(float *corner, Clip at, float coverage, const float *ve
 }
 
 // Write the ramp along an edge, given its ends and its visible face's third vertex. Return false if it gets none.
-INLINE bool write_ramp(const OutlinedPart &part, const float *const vertex[3], Raster raster, float *ramp) {
-  const double half_width = raster.width_px / 2, half_height = raster.height_px / 2;
+INLINE bool write_ramp(const OutlinedPart &part, const float *const vertex[3], double half_width_px, double half_height_px, double ramp_px, float *ramp) {
   Clip clip[3];
   double u[3], v[3];
   for (int k = 0; k < 3; ++k) {
     clip[k] = projected(part.clip_from_part, vertex[k]);
     if (!(clip[k].w > NEAREST)) return false;
-    u[k] = clip[k].x / clip[k].w * half_width, v[k] = clip[k].y / clip[k].w * half_height;
+    u[k] = clip[k].x / clip[k].w * half_width_px, v[k] = clip[k].y / clip[k].w * half_height_px;
   }
   const double along_u = u[1] - u[0], along_v = v[1] - v[0], length = std::hypot(along_u, along_v);
   if (!(length > SHORTEST)) return false;
   const bool apex_is_left = (v[2] - v[0]) * along_u - (u[2] - u[0]) * along_v > 0;
-  const double outward = (apex_is_left ? -raster.ramp_px : raster.ramp_px) / length;
+  const double outward = (apex_is_left ? -ramp_px : ramp_px) / length;
   for (int end = 0; end < 2; ++end) {
     Clip outside = clip[end];
-    outside.x -= along_v * outward / half_width * outside.w, outside.y += along_u * outward / half_height * outside.w;
+    outside.x -= along_v * outward / half_width_px * outside.w, outside.y += along_u * outward / half_height_px * outside.w;
     write_corner(ramp + end * CORNER, clip[end], 1.0f, vertex[end]);
     write_corner(ramp + (2 + end) * CORNER, outside, 0.0f, vertex[end]);
   }
@@ -66,7 +61,7 @@ INLINE bool write_ramp(const OutlinedPart &part, const float *const vertex[3], R
 }  // namespace
 
 // Write the ramps (4 corners each) of parts in a given order, and how many each of them has.
-extern "C" void outline_ramps(const OutlinedPart *parts, const int32_t *order, int count, const Raster *raster, float *ramps, int32_t *counts) {
+extern "C" void outline_ramps(const OutlinedPart *parts, const int32_t *order, int count, double width_px, double height_px, double ramp_px, float *ramps, int32_t *counts) {
   std::vector<uint8_t> facing;
   for (int k = 0; k < count; ++k) {
     const OutlinedPart &part = parts[order[k]];
@@ -83,7 +78,7 @@ extern "C" void outline_ramps(const OutlinedPart *parts, const int32_t *order, i
       const int32_t *ends = part.ends + 4 * e + 2 * which;
       const float *const vertex[3] = {part.vertices + VERTEX * ends[0], part.vertices + VERTEX * ends[1],
                                       part.vertices + VERTEX * part.apex[2 * e + which]};
-      if (write_ramp(part, vertex, *raster, ramps)) ramps += 4 * CORNER, ++counts[k];
+      if (write_ramp(part, vertex, width_px / 2, height_px / 2, ramp_px, ramps)) ramps += 4 * CORNER, ++counts[k];
     }
   }
 }

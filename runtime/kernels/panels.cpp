@@ -148,7 +148,7 @@ INLINE void locate(const Shown &shown, int r, int begin, int count, const float 
   }
 }
 
-// As `locate`, through the panel's homography.
+// Do the same for a panel with a homography, and find which pixels are inside the panel.
 INLINE void locate_registered(const Shown &shown, int r, int begin, int count, const float *upper, const float *lower, float share, Block &block) {
   const ScaleShift at = shown.source_from_panel, push = shown.push;
   const int32_t stride = int32_t(shown.source_stride), rows = shown.source_rows, columns = shown.source_columns;

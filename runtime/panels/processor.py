@@ -140,7 +140,8 @@ class ProcessorPainter:
         """Draw a frame, and return the numbers of the panels whose pictures have changed."""
         solved = self._prepared_solution(frame) if shows_solved(frame) else None
         flat = self._prepared_flat(frame) if shows_flat(frame) else None
-        shown = [self._shown(panel, frame, solved, flat) for panel in range(len(self._screens))]
+        is_moved = not all(map(is_identity, frame.solved_from_shown))
+        shown = [self._shown(panel, frame, solved, flat, is_moved=is_moved) for panel in range(len(self._screens))]
         changed = [panel for panel, (what, _) in enumerate(shown) if what != self._drawn[panel]]
         if changed:
             panels = (ShownPanel * len(changed))(*(shown[panel][1] for panel in changed))
@@ -202,7 +203,7 @@ class ProcessorPainter:
         return pictures
 
     def _shown(
-        self, panel: int, frame: PanelFrame, solved: _Pictures | None, flat: _Pictures | None
+        self, panel: int, frame: PanelFrame, solved: _Pictures | None, flat: _Pictures | None, *, is_moved: bool
     ) -> tuple[object, ShownPanel]:
         """Return what a panel shows, for comparison, and the arguments that draw it."""
         screen, curve = self._screens[panel], self._curves[panel]
@@ -235,7 +236,7 @@ class ProcessorPainter:
             shown.relief_from_screen, shown.push = ScaleShift(*maps[1]), ScaleShift(*maps[2])
         if flat is None:
             coarse = (frame.size_px or solved.size_px)[0] >= COARSE * solved.size_px[0]
-            if coarse and not all(map(is_identity, frame.solved_from_shown)):
+            if coarse and is_moved:
                 shown.every = 2
             return (solved.version, *maps), shown
         other = flat.pictures[panel]

@@ -10,7 +10,7 @@ import pytest
 
 from runtime.content import shapes
 from runtime.content.base import View
-from runtime.content.camera import clip_from_stack, project
+from runtime.content.camera import clip_from_stack, depth_bounds, project
 from runtime.content.procedural import ProceduralSource
 from runtime.content.scenes import SCENES, Scene, Thing
 from runtime.content.triangles import DrawnPart, _Look
@@ -146,4 +146,5 @@ def test_an_eye_in_a_solid_thing_sees_its_inside(context: Any, stack: PanelStack
 
 def _look(source: ProceduralSource, view: View, part: int) -> _Look:
     arranged = source._arranged(0)
-    return _Look(arranged.places[part], clip_from_stack(view, arranged.corners_m.reshape(-1, 3)), view)
+    near_m, far_m = depth_bounds(view, arranged.corners_m.reshape(-1, 3))
+    return _Look(arranged.places[part], clip_from_stack(view, near_m=near_m, far_m=far_m), view)

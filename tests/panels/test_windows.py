@@ -201,6 +201,7 @@ def test_a_registered_panel_is_drawn_on_the_processor_too(opened: Callable[..., 
     shift = ((1.0, 0.0, 5.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     sink = opened(PanelSettings(connector="DUMMY2", homography=shift), *BY_CONNECTOR[1:])
     sink.present(frame(7))
+    assert not sink._windows.opengl
     expected = np.roll(picture(7, 0), 5, axis=1)
     expected[:, :5] = 0
     assert shows(x, 2, expected)
