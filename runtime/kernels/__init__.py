@@ -152,7 +152,7 @@ def library() -> Any:
         function.argtypes, function.restype = arguments, None
     short = ctypes.PyDLL(str(built))  # keeps the GIL, because the presenter could wait for it longer than it takes
     loops.frame_picture = short.frame_picture
-    loops.frame_picture.argtypes = [_pointer, _long, _long, _int, _int, _pointer, _int, _int]
+    loops.frame_picture.argtypes = [_pointer, _long, _long, _int, _int, _pointer, _int, _int, _pointer]
     loops.frame_picture.restype = None
     for name, value in COMPILED.items():
         try:

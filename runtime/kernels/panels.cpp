@@ -369,18 +369,26 @@ bool start(pthread_t &thread, Part &part) {
 }  // namespace
 
 // Copy a turned picture into the middle of one that has a border. The turned picture's next row and next column are
-// `row_step` and `column_step` bytes away.
-extern "C" void frame_picture(const uint8_t *turned, int64_t row_step, int64_t column_step, int rows, int columns, uint8_t *framed, int border_px, int extended) {
+// `row_step` and `column_step` bytes away. Return the box of the pixels that differ from the border in colour: its left,
+// top, right and bottom edge in the framed picture. Without a border, the box is meaningless.
+extern "C" void frame_picture(const uint8_t *turned, int64_t row_step, int64_t column_step, int rows, int columns, uint8_t *framed, int border_px, int extended, int32_t *box) {
   const int width = columns + 2 * border_px;
   auto *middle = reinterpret_cast<Word *>(framed) + border_px * (width + 1);
+  const Word border = *reinterpret_cast<const Word *>(framed) << 8;  // without alpha
+  int left = columns, top = rows, right = 0, bottom = 0;
   for (int r = 0; r < rows; ++r) {
     const uint8_t *from = turned + r * row_step;
     Word *to = middle + int64_t(r) * width;
     if (column_step == 4) std::memcpy(to, from, size_t(columns) * 4);
     else
       for (int c = 0; c < columns; ++c) to[c] = *reinterpret_cast<const Word *>(from + c * column_step);
+    int first = 0, end = columns;
+    while (first < columns && to[first] << 8 == border) ++first;
+    while (end > first && to[end - 1] << 8 == border) --end;
+    if (first < end) left = std::min(left, first), right = std::max(right, end), top = std::min(top, r), bottom = r + 1;
     if (extended) to[-1] = to[0], to[columns] = to[columns - 1];
   }
+  box[0] = left + border_px, box[1] = top + border_px, box[2] = right + border_px, box[3] = bottom + border_px;
   if (!extended) return;
   Word *last = middle + int64_t(rows - 1) * width;
   std::memcpy(middle - width - 1, middle - 1, size_t(columns + 2) * 4);

@@ -12,6 +12,7 @@ import moderngl
 from runtime.clock import Clock
 from runtime.config import PanelSettings
 from runtime.errors import PanelLost
+from runtime.optics.rect import PixelRect
 from runtime.panels.display import Display, Window, gl_function, glfw, x_display
 from runtime.panels.monitors import Monitor
 from runtime.panels.presentation import FrameTextures, Painter
@@ -175,7 +176,7 @@ class ProcessorWindows(PanelWindows):
         """
         super().__init__()
         self._pictures: list[SharedPicture] = []
-        self._changed: list[int] = []
+        self._changed: dict[int, PixelRect] = {}  # changed parts of the pictures
         try:
             for number, monitor in enumerate(monitors):
                 window = display.fullscreen_window(monitor, title=f"panel {number}", opengl=False)
@@ -209,8 +210,9 @@ class ProcessorWindows(PanelWindows):
         shown = 0
         for panel, (window, picture) in enumerate(zip(self.windows, self._pictures, strict=True)):
             if panel in self._changed or window.exposed:
+                part = None if window.exposed else self._changed[panel]
                 window.exposed = False
-                picture.put()
+                picture.put(part)
                 shown += 1
         flush(x_display())
         # The X server copies the pictures meanwhile. Waiting for it would leave too little time to draw the next frame.

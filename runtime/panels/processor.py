@@ -11,6 +11,7 @@ and takes Python's global lock as rarely as possible.
 
 from __future__ import annotations
 
+import ctypes
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,10 +25,12 @@ from runtime.config import PanelSettings
 from runtime.kernels import CURVE_ENTRIES, CURVE_STEPS, ScaleShift, ShownPanel, library
 from runtime.optics.alignment import is_identity, scale_and_shift
 from runtime.optics.malus import rest_code
+from runtime.optics.rect import PixelRect, union
 from runtime.optics.relief import displacement
 from runtime.panels import lut
 from runtime.panels.geometry import layer_from_screen, panel_from_screen
 from runtime.panels.presentation import shows_flat, shows_solved
+from runtime.panels.shown_part import filled_part, limit
 from runtime.records import F32, F64, U8, PanelFrame
 
 # If solutions coarser than the panels by this factor are moved by the alignment, they are sampled at every other pixel.
@@ -66,6 +69,7 @@ class Mounting(NamedTuple):
     down: Axis
     turned_px: tuple[int, int]  # width and height of the turned layer
     turned_from_screen: F64 | None  # 3x3 homography from the monitor's pixels, or None if they coincide
+    screen_from_turned: F64 | None  # its inverse
 
     @classmethod
     def of(cls, settings: PanelSettings, *, screen_px: tuple[int, int], layer_px: tuple[int, int]) -> Mounting:
@@ -94,7 +98,9 @@ class Mounting(NamedTuple):
         turned = np.asarray(np.linalg.solve(turn, layer_from_monitor), np.float64)
         turned /= turned[2] @ np.array([screen_px[0] / 2, screen_px[1] / 2, 1.0])  # its sign is arbitrary
         coincides = turned_px == screen_px and np.allclose(turned, np.eye(3), rtol=0.0, atol=1e-9)
-        return cls(axes[0], axes[1], turned_px, None if coincides else turned)
+        if coincides:
+            return cls(axes[0], axes[1], turned_px, None, None)
+        return cls(axes[0], axes[1], turned_px, turned, np.asarray(np.linalg.inv(turned), np.float64))
 
     def on_screen(self, picture: Array) -> Array:
         """Turn a picture, (h, w) or (h, w, 4), from how the viewer sees it to how the monitor shows it."""
@@ -111,7 +117,9 @@ class _Pictures:
     size_px: tuple[int, int]  # width and height as seen by the viewer
     border_px: int
     pictures: tuple[U8, ...]  # RGBA, turned for the monitors
+    boxes: tuple[PixelRect, ...]  # in each picture, what differs from the rest code
     reliefs: tuple[F32, ...] = ()
+    rises: tuple[float, ...] = ()  # each relief's largest absolute value
 
 
 class ProcessorPainter:
@@ -134,35 +142,51 @@ class ProcessorPainter:
         self._flat: _Pictures | None = None
         self._memory: dict[object, tuple[U8, ...]] = {}  # pictures, reused for layers of the same size
         self._drawn: list[object] = [None] * len(screens)  # what each picture shows
+        self._filled = [_whole(screen) for screen in screens]  # outside, a picture shows the rest code
         self._threads = min(len(os.sched_getaffinity(0)), MOST_THREADS)
 
-    def draw(self, frame: PanelFrame) -> list[int]:
-        """Draw a frame, and return the numbers of the panels whose pictures have changed."""
+    def draw(self, frame: PanelFrame) -> dict[int, PixelRect]:
+        """Draw a frame, and return the part of each panel's picture that has changed, by the panel's number."""
         solved = self._prepared_solution(frame) if shows_solved(frame) else None
         flat = self._prepared_flat(frame) if shows_flat(frame) else None
         is_moved = not all(map(is_identity, frame.solved_from_shown))
-        shown = [self._shown(panel, frame, solved, flat, is_moved=is_moved) for panel in range(len(self._screens))]
-        changed = [panel for panel, (what, _) in enumerate(shown) if what != self._drawn[panel]]
-        if changed:
-            panels = (ShownPanel * len(changed))(*(shown[panel][1] for panel in changed))
-            library().draw_panels(panels, len(changed), self._threads)
-        for panel in changed:
-            self._drawn[panel] = shown[panel][0]
+        changed: dict[int, PixelRect] = {}
+        to_draw: list[ShownPanel] = []
+        for panel in range(len(self._screens)):
+            what, shown = self._shown(panel, frame, solved, flat, is_moved=is_moved)
+            if what == self._drawn[panel]:
+                continue
+            filled = _whole(self._screens[panel]) if solved is None or flat else self._filled_by(panel, shown, solved)
+            part = union((filled, self._filled[panel]))
+            self._drawn[panel], self._filled[panel] = what, filled
+            if part.width_px:
+                changed[panel] = part
+                limit(shown, part)
+                to_draw.append(shown)
+        if to_draw:
+            library().draw_panels((ShownPanel * len(to_draw))(*to_draw), len(to_draw), self._threads)
         return changed
+
+    def _filled_by(self, panel: int, shown: ShownPanel, solved: _Pictures) -> PixelRect:
+        """Return the part of a panel's picture outside which a solution shows the rest code."""
+        mounting, rise = self._mountings[panel], solved.rises[panel] if shown.relief else 0.0
+        return filled_part(shown, solved.boxes[panel], rise=rise, screen_from_panel=mounting.screen_from_turned)
 
     def _prepared_solution(self, frame: PanelFrame) -> _Pictures:
         assert frame.solved is not None
         if self._solved is None or self._solved.version != frame.solved_version:
             height, width = frame.solved.shape[1:3]
             coarse = frame.size_px not in (None, (width, height))
-            pictures = self._prepared(frame.solved, border_px=2 if coarse else 1, extended=coarse)
+            pictures, boxes = self._prepared(frame.solved, border_px=2 if coarse else 1, extended=coarse)
             reliefs: tuple[F32, ...] = ()
+            rises: tuple[float, ...] = ()
             if frame.relief is not None:
                 reliefs = tuple(
                     _registered(mounting.on_screen(frame.relief), mounting, screen_px=_size_px(screen), reduced=True)
                     for mounting, screen in zip(self._mountings, self._screens, strict=True)
                 )
-            self._solved = _Pictures(frame.solved_version, (width, height), 1 + coarse, pictures, reliefs)
+                rises = tuple(float(np.abs(relief).max()) for relief in reliefs)
+            self._solved = _Pictures(frame.solved_version, (width, height), 1 + coarse, pictures, boxes, reliefs, rises)
         return self._solved
 
     def _prepared_flat(self, frame: PanelFrame) -> _Pictures:
@@ -172,14 +196,18 @@ class ProcessorPainter:
             pictures = tuple(
                 _registered(picture, mounting, screen_px=_size_px(screen))
                 for picture, mounting, screen in zip(
-                    self._prepared(frame.flat, border_px=0), self._mountings, self._screens, strict=True
+                    self._prepared(frame.flat, border_px=0)[0], self._mountings, self._screens, strict=True
                 )
             )
-            self._flat = _Pictures(frame.flat_version, size_px, 0, pictures)
+            self._flat = _Pictures(frame.flat_version, size_px, 0, pictures, tuple(map(_whole, pictures)))
         return self._flat
 
-    def _prepared(self, layers: U8, *, border_px: int, extended: bool = False) -> tuple[U8, ...]:
+    def _prepared(
+        self, layers: U8, *, border_px: int, extended: bool = False
+    ) -> tuple[tuple[U8, ...], tuple[PixelRect, ...]]:
         """Turn layers for the monitors, and surround them with the rest code.
+
+        Also returns the box of each picture's pixels that differ from that code.
 
         Layers of the same size and border reuse the memory of the last ones.
 
@@ -194,13 +222,15 @@ class ProcessorPainter:
             rest = min(rest_code(len(layers)), 255)
             border = (border_px,) * 2, (border_px,) * 2, (0, 0)
             self._memory[key] = tuple(np.pad(picture, border, constant_values=rest) for picture in turned)
-        pictures = self._memory[key]
+        pictures, boxes = self._memory[key], []
         for picture, layer in zip(pictures, turned, strict=True):
             rows, columns = layer.shape[:2]
+            box = (ctypes.c_int32 * 4)()
             library().frame_picture(
-                layer.ctypes.data, *layer.strides[:2], rows, columns, picture.ctypes.data, border_px, extended
+                layer.ctypes.data, *layer.strides[:2], rows, columns, picture.ctypes.data, border_px, extended, box
             )
-        return pictures
+            boxes.append(PixelRect(*box))
+        return pictures, tuple(boxes)
 
     def _shown(
         self, panel: int, frame: PanelFrame, solved: _Pictures | None, flat: _Pictures | None, *, is_moved: bool
@@ -271,6 +301,10 @@ class ProcessorPainter:
             at_edge = moved.drift_px[to] + moved.growth * (middle[to] * axis.offset_px + middle[2 + to])
             along[2].append((by * moved.growth * middle[to], axis.sign * by * at_edge))
         return [(across[0], down[0], across[1], down[1]) for across, down in filter(None, along)]
+
+
+def _whole(picture: U8) -> PixelRect:
+    return PixelRect(0, 0, *_size_px(picture))
 
 
 def _size_px(picture: U8 | F32) -> tuple[int, int]:

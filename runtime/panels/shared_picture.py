@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from runtime.optics.rect import PixelRect
 from runtime.panels import xlib
 from runtime.records import U8
 
@@ -120,10 +121,12 @@ class SharedPicture:
             self.close()
             raise
 
-    def put(self) -> None:
-        """Ask the X server to copy the picture to its window. `finish` waits for it."""
-        size = self._image.contents.width, self._image.contents.height
-        _short_calls()[1].XShmPutImage(self._display, self._window, self._context, self._image, 0, 0, 0, 0, *size, 0)
+    def put(self, part: PixelRect | None = None) -> None:
+        """Ask the X server to copy the picture, or part of it, to its window. `finish` waits for it."""
+        image = self._image.contents
+        part = part or PixelRect(0, 0, image.width, image.height)
+        at, size = (part.u0, part.v0), (part.width_px, part.height_px)
+        _short_calls()[1].XShmPutImage(self._display, self._window, self._context, self._image, *at, *at, *size, 0)
 
     def close(self) -> None:
         """Release the memory. May be called more than once. `pixels` must not be used afterwards."""

@@ -7,6 +7,7 @@ import numpy as np
 
 from runtime.clock import Clock
 from runtime.config import PanelSettings
+from runtime.optics.rect import PixelRect
 from runtime.panels.presentation import FrameTextures, Painter
 from runtime.panels.processor import Mounting, ProcessorPainter
 from runtime.panels.registry import OffscreenPanels
@@ -84,8 +85,8 @@ class ProcessorDrawnPanels(OffscreenPanels):
         self._frame = frame
         return super().present(frame, unchanged=unchanged)
 
-    def drawn(self, frame: PanelFrame) -> list[int]:
-        """Numbers of the panels that a frame changes."""
+    def drawn(self, frame: PanelFrame) -> dict[int, PixelRect]:
+        """The part of each panel's picture that a frame changes, by the panel's number."""
         return self._painter.draw(frame)
 
     def read_back(self) -> tuple[U8, ...]:

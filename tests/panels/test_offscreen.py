@@ -364,10 +364,10 @@ def test_on_the_processor_only_panels_that_change_are_drawn() -> None:
     )
     alike, moved = align(STACK, solved_for_m=HEAD, eyes_m=HEAD), align(STACK, solved_for_m=HEAD, eyes_m=HEAD * 1.01)
     layers = smooth(1)
-    assert sink.drawn(PanelFrame(1, layers, 1, alike.solved_from_shown)) == [0, 1, 2]
-    assert sink.drawn(PanelFrame(2, layers, 1, moved.solved_from_shown)) == [0, 2]
-    assert sink.drawn(PanelFrame(3, layers, 1, moved.solved_from_shown)) == []
-    assert sink.drawn(PanelFrame(4, smooth(2), 2, moved.solved_from_shown)) == [0, 1, 2]
+    assert list(sink.drawn(PanelFrame(1, layers, 1, alike.solved_from_shown))) == [0, 1, 2]
+    assert list(sink.drawn(PanelFrame(2, layers, 1, moved.solved_from_shown))) == [0, 2]
+    assert list(sink.drawn(PanelFrame(3, layers, 1, moved.solved_from_shown))) == []
+    assert list(sink.drawn(PanelFrame(4, smooth(2), 2, moved.solved_from_shown))) == [0, 1, 2]
 
 
 @pytest.mark.parametrize("size_px", [(480, 320), (477, 319)])
