@@ -80,8 +80,9 @@ def simulated_costs(stage_ms: Mapping[str, float], reductions: Iterable[int]) ->
 class CostBook:
     """Keeps running means of each raster's stage times.
 
-    If a raster has not been used for `KEPT_SOLUTIONS` solutions, its times are discarded, because the load on the
-    machine may have changed.
+    When a solution changes the means of its stages, all other means change in proportion, because other work on the
+    machine slows down every raster alike. If a raster has not been used for `KEPT_SOLUTIONS` solutions, its times are discarded,
+    because the scene may have changed.
     """
 
     def __init__(self, first: Mapping[int, Mapping[str, float]]) -> None:
@@ -101,13 +102,18 @@ class CostBook:
         self._measured = {by: means for by, means in self._measured.items() if self._unused[by] < KEPT_SOLUTIONS}
         means = self._measured.setdefault(effort.reduction, {})
         steps = effort.steps - (effort.continued_from or 0)
-        for stage in (*SOLVING_STAGES, REST):
-            if effort.continued_from is not None and stage not in ("finish", "step", REST):
-                continue
-            if stage == "step" and not steps:
-                continue
-            spent_ms = stage_ms.get(stage, 0.0) / (steps if stage == "step" else 1)
-            means[stage] = means.get(stage, spent_ms) + GAIN * (spent_ms - means.get(stage, spent_ms))
+        begun = ("finish", REST) if effort.continued_from is not None else (*SOLVING_STAGES[:-1], REST)
+        spent_ms = {stage: stage_ms.get(stage, 0.0) for stage in begun}
+        if steps:
+            spent_ms["step"] = stage_ms.get("step", 0.0) / steps
+        known = [stage for stage in spent_ms if stage in means]
+        before_ms = sum(means[stage] for stage in known)
+        means |= {stage: means.get(stage, ms) + GAIN * (ms - means.get(stage, ms)) for stage, ms in spent_ms.items()}
+        after_ms = sum(means[stage] for stage in known)
+        for by, stages in self._measured.items():
+            for stage in stages:
+                if before_ms > 0.0 and (by != effort.reduction or stage not in spent_ms):
+                    stages[stage] *= after_ms / before_ms
 
     def costs(self) -> Costs:
         """Return the current solution costs on every raster.

@@ -168,6 +168,19 @@ def test_times_of_a_raster_long_unused_are_forgotten() -> None:
     assert book.costs().ms(Effort(3, 0)) == pytest.approx(100.0 / 9)
 
 
+def test_other_work_changes_the_times_of_all_rasters_in_proportion() -> None:
+    """Otherwise a raster measured while the machine was busy would be avoided long after."""
+    book = CostBook({by: {"render": 100.0 / by**2, "step": 10.0} for by in REDUCTIONS})
+    for reduction, ms, step_ms in ((2, 60.0, 12.0), (4, 20.0, 6.0)):
+        book.learn(Effort(reduction, 1), {"render": ms, "step": step_ms})
+    for load in (*[3.0] * 20, *[1.5] * 40):
+        book.learn(Effort(4, 0), {"render": 20.0 * load})
+    costs = book.costs()
+    assert costs.ms(Effort(2, 0)) == pytest.approx(1.5 * 60.0, rel=0.01)
+    assert costs.ms(Effort(2, 1)) == pytest.approx(1.5 * 72.0, rel=0.01)
+    assert costs.ms(Effort(4, 1)) == pytest.approx(1.5 * 26.0, rel=0.01)
+
+
 def test_a_continued_solution_teaches_nothing_of_drawing() -> None:
     book = CostBook({1: dict(STAGE_MS)})
     book.learn(Effort(1, 6, continued_from=4), {"render": 0.0, "finish": 38.0, "step": 170.0})
