@@ -24,6 +24,8 @@ from runtime.optics.stack import PanelStack
 from runtime.records import SolveRequest
 from runtime.support.gl import leave_context, offscreen_context
 
+TRIALS = 2, 4  # timed solutions on the full raster and on each coarser one, because other processes may delay some
+
 log = logging.getLogger("phasestack.solver")
 
 
@@ -38,6 +40,7 @@ class RunningSolver:
     owns_context: bool  # True if `close` also releases the context
     contexts_lost: Callable[[], int]  # returns the number of contexts lost by the panels
     generation: int  # this solver's number within the run
+    _calibrated: tuple[Predictor, Mapping[int, Mapping[str, float]]] | None = field(init=False, default=None)
     _owned: RunState = field(init=False)  # `close` releases this state's parts if another solver has started
 
     def __post_init__(self) -> None:
@@ -75,7 +78,23 @@ class RunningSolver:
         return simulated_costs(self.run.state.settings.loop.simulated_stage_ms, self.run.state.predictor.reductions)
 
     def first_costs(self) -> Mapping[int, Mapping[str, float]]:
-        return self.run.state.predictor.warmed_ms
+        predictor = self.run.state.predictor
+        if self._calibrated is None or self._calibrated[0] is not predictor:
+            self._calibrated = predictor, self._trial_costs(predictor)
+        return self._calibrated[1]
+
+    def _trial_costs(self, predictor: Predictor) -> Mapping[int, Mapping[str, float]]:
+        """Return each raster's shortest stage times. If the content cannot be drawn yet, return those of warm-up."""
+        costs: dict[int, dict[str, float]] = {}
+        try:
+            for reduction in predictor.reductions:
+                runs = [self.solver.trial_ms(np.array(EYES_M), reduction) for _ in range(TRIALS[reduction > 1])]
+                costs[reduction] = {stage: min(run.get(stage, 0.0) for run in runs) for stage in runs[0]}
+        except ContextLost:
+            raise
+        except (Exception, SystemExit):  # including a `sys.exit()` in a vendor's code; the first step reports it
+            return predictor.warmed_ms
+        return costs
 
     def close(self) -> None:
         state = self.run.state if self.is_newest else self._owned

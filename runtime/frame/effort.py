@@ -28,9 +28,10 @@ from runtime.records import Effort, Measures
 SOLVING_STAGES = ("render", "prepare", "inference", "finish", "step")
 REST = "rest"  # time between two solutions that belongs to no stage, for measurements and for waking up
 HORIZON_S = 1.0  # how long head and content are assumed to continue as they are
-EQUAL = 1.03  # the fastest effort with a mean error at most this many times the lowest is chosen
-PREFERRED = 0.93  # another effort is chosen if its mean error is below this share of the current effort's
+EQUAL = 1.05  # the fastest effort with a mean error at most this many times the lowest is chosen
+PREFERRED = 0.92  # a slower effort is chosen if its mean error is below this share of the current effort's
 GAIN = 0.2  # weight given to the latest measurement in a running mean
+LOAD_SHARE = 0.8  # exponent of a raster's slowdown in that of the others; the rest is attributed to the raster itself
 KEPT_SOLUTIONS = 100  # a raster's times are discarded after this many solutions on other rasters
 # Squared light error without any steps by reduction, relative to the full raster, and after k steps, relative to none:
 # `balanced` solver, means over the demo, texture and moving scenes at 960x540, with a still and a leaning head and with
@@ -80,17 +81,16 @@ def simulated_costs(stage_ms: Mapping[str, float], reductions: Iterable[int]) ->
 class CostBook:
     """Keeps running means of each raster's stage times.
 
-    When a solution changes the means of its stages, all other means change in proportion, because other work on the
-    machine slows down every raster alike. If a raster has not been used for `KEPT_SOLUTIONS` solutions, its times are discarded,
-    because the scene may have changed.
+    When a solution changes the means of its raster, those of the other rasters change nearly in proportion, because
+    other work on the machine slows down all of them. If a raster has not been used for `KEPT_SOLUTIONS` solutions, its
+    times are discarded, because the scene may have changed.
     """
 
     def __init__(self, first: Mapping[int, Mapping[str, float]]) -> None:
         """Create a cost book with initial times.
 
         Args:
-            first: Time in milliseconds, keyed by reduction and then stage, measured with full pictures before the first
-                refresh.
+            first: Time in milliseconds, keyed by reduction and then stage, measured before the first refresh.
         """
         self.first = first
         self._measured: dict[int, dict[str, float]] = {}
@@ -100,7 +100,10 @@ class CostBook:
         """Update the means with one solution's stage times, in milliseconds."""
         self._unused = {by: count + 1 for by, count in self._unused.items()} | {effort.reduction: 0}
         self._measured = {by: means for by, means in self._measured.items() if self._unused[by] < KEPT_SOLUTIONS}
-        means = self._measured.setdefault(effort.reduction, {})
+        if effort.reduction not in self._measured:
+            expected = self.costs().stages.get(effort.reduction, {})
+            self._measured[effort.reduction] = {s: ms for s, ms in expected.items() if s != REST or self._measured}
+        means = self._measured[effort.reduction]
         steps = effort.steps - (effort.continued_from or 0)
         begun = ("finish", REST) if effort.continued_from is not None else (*SOLVING_STAGES[:-1], REST)
         spent_ms = {stage: stage_ms.get(stage, 0.0) for stage in begun}
@@ -109,11 +112,13 @@ class CostBook:
         known = [stage for stage in spent_ms if stage in means]
         before_ms = sum(means[stage] for stage in known)
         means |= {stage: means.get(stage, ms) + GAIN * (ms - means.get(stage, ms)) for stage, ms in spent_ms.items()}
-        after_ms = sum(means[stage] for stage in known)
+        slowdown = sum(means[stage] for stage in known) / before_ms if before_ms > 0.0 else 1.0
         for by, stages in self._measured.items():
             for stage in stages:
-                if before_ms > 0.0 and (by != effort.reduction or stage not in spent_ms):
-                    stages[stage] *= after_ms / before_ms
+                if by != effort.reduction:
+                    stages[stage] *= slowdown**LOAD_SHARE
+                elif stage not in spent_ms:
+                    stages[stage] *= slowdown
 
     def costs(self) -> Costs:
         """Return the current solution costs on every raster.
@@ -291,8 +296,8 @@ class EffortChooser:
             means[effort] = self.mean_error(error, cost_ms, shown_error=shown_error, horizon_s=horizon_s)
         least = min(means.values())
         best = min((effort for effort in means if means[effort] <= EQUAL * least), key=costs.ms)
-        if self._chosen in means and means[best] > PREFERRED * means[self._chosen]:
-            best = self._chosen
+        if (kept := self._chosen) in means and costs.ms(best) > costs.ms(kept):
+            best = best if means[best] < PREFERRED * means[kept] else kept
         self._chosen = best
         return best
 

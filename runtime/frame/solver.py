@@ -106,6 +106,28 @@ class Solver:
             self._missing = {}  # the latest solution already fulfils the request
         return SolverUpdate(missing=dict(self._missing))
 
+    def trial_ms(self, eyes_m: F64, reduction: int) -> dict[str, float]:
+        """Draw and solve once in one step, discard the result, and return the stage times in milliseconds.
+
+        Args:
+            eyes_m: (2, 3) left and right eye in frame `stack`.
+            reduction: Number to divide the panels' rows and columns by.
+
+        Raises:
+            ContentFailure: The content could not be drawn.
+            ContextLost: The GL context was lost, so this solver can no longer be used.
+            ModelFailure: Inference failed or returned numbers that are not finite.
+        """
+        state, watch = self.run.state, Stopwatch()
+        plan = state.settings.plan
+        job = drawn_job(
+            state.predictor, state.content, eyes_m,
+            time_ns=0, reduction=reduction, trimmed=plan.enabled, in_depth=plan.align,
+        )  # fmt: skip
+        watch.lap("render")
+        state.predictor.solve(replace(job, steps=1), watch)
+        return watch.stage_ms
+
     def _solve(
         self, state: RunState, request: SolveRequest, eyes_m: F64, effort: Effort, *, revision: int
     ) -> SolverUpdate:

@@ -27,7 +27,10 @@ class SolverParts(Protocol):
         """Return the solution costs that apply on a simulated clock with the current settings."""
 
     def first_costs(self) -> Mapping[int, Mapping[str, float]]:
-        """Return the times measured during warm-up, in milliseconds, keyed by reduction and then stage."""
+        """Return the times of solutions in milliseconds, keyed by reduction and then stage.
+
+        They are measured at the first call and whenever the model has changed. Called on the solver's thread.
+        """
 
     def close(self) -> None:
         """Release all resources not in use by a newer solver.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
+from itertools import groupby, pairwise
 
 import pytest
 from hypothesis import given
@@ -80,14 +80,14 @@ def test_what_is_shown_badly_is_answered_quickly() -> None:
     assert costs.ms(chosen(0.0, shown_error=0.05)) < costs.ms(chosen(0.0, shown_error=1e-3))
 
 
-def test_the_present_effort_is_kept_while_another_is_hardly_better() -> None:
+def test_between_nearly_equal_efforts_the_faster_one_is_kept() -> None:
     """Noise in the head's speed about the point where two efforts are equal does not show as flicker."""
-    costs, chooser, picked = simulated_costs(STAGE_MS, REDUCTIONS), EffortChooser(), set()
+    costs, chooser, picked = simulated_costs(STAGE_MS, REDUCTIONS), EffortChooser(), list[Effort]()
     changes = sorted({speed: chosen(speed) for speed in [k / 500 for k in range(500)]}.items())
     border = next(b[0] for a, b in pairwise(changes) if a[1] != b[1])
     for k in range(50):
         speed = border * (1.0 + 0.02 * math.sin(k))
-        picked.add(
+        picked.append(
             chooser.choose(
                 candidates(REDUCTIONS, 4),
                 costs,
@@ -96,7 +96,8 @@ def test_the_present_effort_is_kept_while_another_is_hardly_better() -> None:
                 period_ms=PERIOD_MS,
             )
         )
-    assert len(picked) == 1
+    taken_ms = [costs.ms(effort) for effort, _ in groupby(picked)]
+    assert len(taken_ms) <= 2 and taken_ms == sorted(taken_ms, reverse=True)
 
 
 def test_rates_of_change_are_learned_from_successive_pictures() -> None:
@@ -140,8 +141,8 @@ def test_measured_costs_replace_first_ones_and_scale_those_of_other_rasters() ->
     for _ in range(60):  # a sparse scene: a third of the time
         book.learn(Effort(2, 0), {stage: ms / 12 for stage, ms in STAGE_MS.items()})
     costs = book.costs()
-    assert costs.ms(Effort(2, 0)) == pytest.approx(153.0 / 12)
-    assert costs.ms(Effort(1, 0)) == pytest.approx(153.0 / 3)
+    assert costs.ms(Effort(2, 0)) == pytest.approx(153.0 / 12, rel=0.01)
+    assert costs.ms(Effort(1, 0)) == pytest.approx(153.0 / 3, rel=0.01)
 
 
 def test_time_that_belongs_to_no_stage_counts_for_every_raster() -> None:
@@ -160,25 +161,34 @@ def test_a_first_time_that_other_work_delayed_does_not_exclude_a_raster() -> Non
 
 def test_times_of_a_raster_long_unused_are_forgotten() -> None:
     book = CostBook({by: {"render": 100.0 / by**2} for by in REDUCTIONS})
-    for _ in range(20):  # measured while other work slowed everything
+    for _ in range(80):  # a raster that is slow for itself
+        book.learn(Effort(2, 0), {"render": 25.0})
         book.learn(Effort(3, 0), {"render": 50.0})
-    assert book.costs().ms(Effort(3, 0)) == pytest.approx(50.0)
+    assert book.costs().ms(Effort(3, 0)) == pytest.approx(50.0, rel=0.1)
     for _ in range(KEPT_SOLUTIONS):
         book.learn(Effort(2, 0), {"render": 25.0})
     assert book.costs().ms(Effort(3, 0)) == pytest.approx(100.0 / 9)
 
 
-def test_other_work_changes_the_times_of_all_rasters_in_proportion() -> None:
+def test_other_work_changes_the_times_of_all_rasters() -> None:
     """Otherwise a raster measured while the machine was busy would be avoided long after."""
-    book = CostBook({by: {"render": 100.0 / by**2, "step": 10.0} for by in REDUCTIONS})
-    for reduction, ms, step_ms in ((2, 60.0, 12.0), (4, 20.0, 6.0)):
-        book.learn(Effort(reduction, 1), {"render": ms, "step": step_ms})
-    for load in (*[3.0] * 20, *[1.5] * 40):
-        book.learn(Effort(4, 0), {"render": 20.0 * load})
+    book = CostBook({by: {"render": 100.0 / by**2, "step": 10.0 / by**2} for by in REDUCTIONS})
+    for _ in range(40):
+        book.learn(Effort(2, 1), {"render": 25.0, "step": 2.5})
+    for load in (*[3.0] * 20, *[1.0] * 40):
+        book.learn(Effort(4, 0), {"render": 6.25 * load})
+        assert book.costs().ms(Effort(2, 0)) == pytest.approx(4 * book.costs().ms(Effort(4, 0)), rel=0.25)
+    assert book.costs().ms(Effort(2, 1)) == pytest.approx(27.5, rel=0.01)
+    assert book.costs().ms(Effort(4, 1)) == pytest.approx(27.5 / 4, rel=0.01)
+
+
+def test_the_ratio_between_rasters_is_learned_by_using_both() -> None:
+    book = CostBook({by: {"render": 100.0 / by**2} for by in REDUCTIONS})
+    for _ in range(60):  # drawing the scene takes as long on every raster
+        for reduction in (2, 4):
+            book.learn(Effort(reduction, 0), {"render": 25.0})
     costs = book.costs()
-    assert costs.ms(Effort(2, 0)) == pytest.approx(1.5 * 60.0, rel=0.01)
-    assert costs.ms(Effort(2, 1)) == pytest.approx(1.5 * 72.0, rel=0.01)
-    assert costs.ms(Effort(4, 1)) == pytest.approx(1.5 * 26.0, rel=0.01)
+    assert costs.ms(Effort(2, 0)) == pytest.approx(costs.ms(Effort(4, 0)), rel=0.15)
 
 
 def test_a_continued_solution_teaches_nothing_of_drawing() -> None:
