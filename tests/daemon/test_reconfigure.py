@@ -14,6 +14,7 @@ from runtime.config import Settings
 from runtime.daemon import reconfigure
 from runtime.daemon.reconfigure import Reconfiguration
 from runtime.daemon.solver_parts import RunningSolver, SolverMaker, ready_predictor
+from runtime.errors import ContentFailure
 from runtime.eyes.calibration import load_calibration
 from runtime.frame.run_state import RunState
 from runtime.records import SolveRequest
@@ -158,3 +159,23 @@ def test_what_is_decided_anew_for_every_solution_loads_no_model(bench: Bench) ->
     bench.advance(change)
     assert bench.state.predictor is before.predictor
     assert bench.models == []
+
+
+def test_costs_are_calibrated_with_the_scene_once_for_each_model(bench: Bench) -> None:
+    first = bench.parts.first_costs()
+    assert set(first) == set(bench.state.predictor.reductions)
+    assert all(stages["render"] > 0 and stages["finish"] > 0 for stages in first.values())
+    assert bench.parts.first_costs() is first
+    bench.advance(bench.change(settings(**MODEL)))
+    after = bench.parts.first_costs()
+    assert after is not first and set(after) == set(bench.state.predictor.reductions)
+
+
+def test_content_that_cannot_be_drawn_yet_leaves_the_costs_of_warm_up(bench: Bench) -> None:
+    def missing(*_: Any, **__: Any) -> Any:
+        raise ContentFailure("no program is connected")
+
+    bench.first_content.draw = missing  # type: ignore[attr-defined]
+    assert bench.parts.first_costs() == bench.state.predictor.warmed_ms
+    del bench.first_content.draw  # type: ignore[attr-defined]
+    assert bench.solve() is not None
