@@ -24,7 +24,7 @@ from runtime.optics.stack import PanelStack
 from runtime.records import SolveRequest
 from runtime.support.gl import leave_context, offscreen_context
 
-TRIALS = 2, 4  # timed solutions on the full raster and on each coarser one, because other processes may delay some
+TRIALS = 1, 3  # timed solutions on the full raster and on each coarser one, because other processes may delay some
 
 log = logging.getLogger("phasestack.solver")
 

@@ -239,7 +239,10 @@ class SolverThread(SolverHost):
     def _adopt_model(self, attempt: _Attempt, parts: SolverParts) -> None:
         """Discard the measured costs if a task has replaced the model, because rasters and costs may differ."""
         assert attempt.costs is not None
-        if (first := parts.first_costs()) != attempt.costs.first:
+        attempt.busy_since_ns, attempt.is_at_task = self._clock.now_ns(), True
+        first = parts.first_costs()
+        attempt.busy_since_ns, attempt.is_at_task = 0, False
+        if first != attempt.costs.first:
             attempt.costs = CostBook(first)
             self._costs = attempt.costs.costs()
 

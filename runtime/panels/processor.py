@@ -150,25 +150,32 @@ class ProcessorPainter:
         solved = self._prepared_solution(frame) if shows_solved(frame) else None
         flat = self._prepared_flat(frame) if shows_flat(frame) else None
         is_moved = not all(map(is_identity, frame.solved_from_shown))
-        changed: dict[int, PixelRect] = {}
-        to_draw: list[ShownPanel] = []
+        drawn, filled, parts, to_draw = list(self._drawn), list(self._filled), {}, []
         for panel in range(len(self._screens)):
-            what, shown = self._shown(panel, frame, solved, flat, is_moved=is_moved)
-            if what == self._drawn[panel]:
+            drawn[panel], shown = self._shown(panel, frame, solved, flat, is_moved=is_moved)
+            if drawn[panel] == self._drawn[panel]:
                 continue
-            filled = _whole(self._screens[panel]) if solved is None or flat else self._filled_by(panel, shown, solved)
-            part = union((filled, self._filled[panel]))
-            self._drawn[panel], self._filled[panel] = what, filled
+            filled[panel] = self._filled_by(panel, shown, solved if flat is None else None)
+            part = union((filled[panel], self._filled[panel]))
             if part.width_px:
-                changed[panel] = part
                 limit(shown, part)
                 to_draw.append(shown)
+                parts[panel] = part
         if to_draw:
             library().draw_panels((ShownPanel * len(to_draw))(*to_draw), len(to_draw), self._threads)
-        return changed
+        self._drawn, self._filled = drawn, filled
+        return parts
 
-    def _filled_by(self, panel: int, shown: ShownPanel, solved: _Pictures) -> PixelRect:
-        """Return the part of a panel's picture outside which a solution shows the rest code."""
+    def _filled_by(self, panel: int, shown: ShownPanel, solved: _Pictures | None) -> PixelRect:
+        """Return the part of a panel's picture outside which it shows the rest code.
+
+        Args:
+            panel: The panel's number.
+            shown: Arguments that draw the whole picture.
+            solved: The solution, or None if the flat picture is shown or mixed in.
+        """
+        if solved is None:
+            return _whole(self._screens[panel])
         mounting, rise = self._mountings[panel], solved.rises[panel] if shown.relief else 0.0
         return filled_part(shown, solved.boxes[panel], rise=rise, screen_from_panel=mounting.screen_from_turned)
 
@@ -207,14 +214,15 @@ class ProcessorPainter:
     ) -> tuple[tuple[U8, ...], tuple[PixelRect, ...]]:
         """Turn layers for the monitors, and surround them with the rest code.
 
-        Also returns the box of each picture's pixels that differ from that code.
-
         Layers of the same size and border reuse the memory of the last ones.
 
         Args:
             layers: (N, h, w, 4) RGBA layers.
             border_px: Width of the border.
             extended: True to repeat the layers' edge pixels in the innermost pixel of the border.
+
+        Returns:
+            The pictures, and in each the box of the pixels that differ from the rest code.
         """
         turned = [mounting.on_screen(layer) for layer, mounting in zip(layers, self._mountings, strict=True)]
         key = layers.shape, border_px
