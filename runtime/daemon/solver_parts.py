@@ -24,7 +24,9 @@ from runtime.optics.stack import PanelStack
 from runtime.records import SolveRequest
 from runtime.support.gl import leave_context, offscreen_context
 
-TRIALS = 1, 3  # timed solutions on the full raster and on each coarser one, because other processes may delay some
+# Timed solutions on the full raster and on each coarser one. The first compiles shaders, and other processes may delay
+# some, so only the shortest times count.
+TRIALS = 2, 3
 
 log = logging.getLogger("phasestack.solver")
 
@@ -127,14 +129,14 @@ class SolverMaker:
                 thread.
         """
         self._settings, self._stack, self._calibration = settings, stack, calibration
-        self.run: RunCell | None = None  # set when the first solver is made
+        self.run: RunCell | None = None  # None until the first solver exists
         self.parts: RunningSolver | None = None  # the latest solver
         self._device: Wanted = settings.model.backend
         self._contexts_lost = contexts_lost
         self._prepared: tuple[ContentSettings, Opener] | None = None  # content that was read but not yet opened
 
     def __call__(self, *, context: Any = None, simulated: bool = False) -> RunningSolver:
-        """Create a solver with the current settings. If this fails, everything opened so far is closed.
+        """Create a solver with the current settings. If this fails, everything that it opened is closed.
 
         Args:
             context: GL context to share with the panels. None creates a new context.

@@ -1,7 +1,7 @@
 // Draw the panels' pictures on the processor (runtime/panels/processor.py): sample a layer, which may be coarse and
 // displaced by the content's relief, mix it with the flat picture and apply the panel's grey curve. Pixels have four
 // bytes, in the order RGBA in pictures and BGRX on the screen. Positions in pictures count from the centre of the top left pixel, positions on the screen and the panel from
-// their corners. The panel's pixels are turned like the screen's, and coincide with them unless a homography is given.
+// their corners. The panel's pixels are turned like the screen's, and coincide with them unless `registered` is 1.
 #include <pthread.h>
 #include <sched.h>
 

@@ -141,7 +141,7 @@ class ProcessorPainter:
         self._solved: _Pictures | None = None
         self._flat: _Pictures | None = None
         self._memory: dict[object, tuple[U8, ...]] = {}  # pictures, reused for layers of the same size
-        self._drawn: list[object] = [None] * len(screens)  # what each picture shows
+        self._drawn: list[object] = [None] * len(screens)  # key of each picture's content
         self._filled = [_whole(screen) for screen in screens]  # outside, a picture shows the rest code
         self._threads = min(len(os.sched_getaffinity(0)), MOST_THREADS)
 
@@ -243,7 +243,7 @@ class ProcessorPainter:
     def _shown(
         self, panel: int, frame: PanelFrame, solved: _Pictures | None, flat: _Pictures | None, *, is_moved: bool
     ) -> tuple[object, ShownPanel]:
-        """Return what a panel shows, for comparison, and the arguments that draw it."""
+        """Return a key that identifies the panel's picture, and the arguments that draw it."""
         screen, curve = self._screens[panel], self._curves[panel]
         shown = ShownPanel(
             screen=screen.ctypes.data,

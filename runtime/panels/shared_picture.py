@@ -20,7 +20,7 @@ from runtime.records import U8
 PRIVATE, CREATE, OWNER_ONLY, REMOVE = 0, 0o1000, 0o600, 0  # arguments of shmget and shmctl
 Z_PIXMAP, ALL_PLANES = 2, 0xFFFFFFFF
 # The picture's first byte in its segment. On an AMD Zen 3 processor, the X server's copy takes 1.5 times as long if
-# rows lie just below their destinations modulo 4 KiB, as they do if the picture begins at a page's start.
+# the rows' addresses are just below their destinations modulo 4 KiB, as with a picture at the start of a page.
 FIRST_BYTE = 128
 
 

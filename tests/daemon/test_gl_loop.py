@@ -27,7 +27,7 @@ from tests.waiting import eventually
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 240, 136)
 ON_WINDOWS: dict[str, Any] = {
-    "model": {"backend": "gl", "effort": "full"},
+    "model": {"backend": "gl"},
     "loop": {"rate_hz": 100.0},
     "stack": {"width_px": xserver.WIDTH_PX, "height_px": xserver.HEIGHT_PX},
     "output": {"kind": "windows", "panels": [{"connector": f"DUMMY{index}"} for index in range(3)]},
