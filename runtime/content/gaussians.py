@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
 from runtime.content.base import View
+from runtime.content.camera import NEAREST_M
 from runtime.content.ply import PlyHeader, read_elements
 from runtime.errors import InputError
 from runtime.records import F32, F64
@@ -247,7 +248,7 @@ def moved(gaussians: Gaussians, target_from_source: F64) -> Gaussians:
     return Gaussians(centres.astype(np.float32), packed, gaussians.opacities, gaussians.harmonics)
 
 
-def seen_splats(gaussians: Gaussians, view: View, *, nearest_m: float = 1e-3) -> Splats:
+def seen_splats(gaussians: Gaussians, view: View) -> Splats:
     """Project the visible splats to first order (EWA, Zwicker et al. 2001), and sort them by distance.
 
     The view's 3x4 projection P may map to a panel's pixels or to those of an eye's image. Pixel coordinate u_i has the
@@ -255,13 +256,12 @@ def seen_splats(gaussians: Gaussians, view: View, *, nearest_m: float = 1e-3) ->
 
     Args:
         gaussians: Splats in frame `stack`.
-        view: View to project the splats into.
-        nearest_m: Splats whose centre is nearer to the eye than this are left out.
+        view: View to project the splats into. Splats whose centre is nearer to the eye than `NEAREST_M` are left out.
     """
     projection = view.pixels_from_stack.astype(np.float32)
     homogeneous = gaussians.centres @ projection[:, :3].T + projection[:, 3]
     w = homogeneous[:, 2]
-    shown = np.flatnonzero((w > nearest_m) & (gaussians.opacities > ALPHA_MIN))
+    shown = np.flatnonzero((w > NEAREST_M) & (gaussians.opacities > ALPHA_MIN))
     u, v = (homogeneous[shown, :2] / w[shown, None]).T
     p0, p1, p2 = projection[:, :3]
     weight = 1 / w[shown]

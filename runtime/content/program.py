@@ -27,6 +27,7 @@ from websockets.sync.server import ServerConnection, serve
 from runtime.clock import NS_PER_S
 from runtime.config import Section, validated
 from runtime.content.base import ContentInfo, ContentSource, View
+from runtime.content.camera import clip_from_stack
 from runtime.content.placing import SceneFile
 from runtime.errors import ContentFailure, InputError, one_line
 from runtime.records import U8
@@ -73,12 +74,8 @@ def camera_of(view: View) -> dict[str, Any]:
     camera = np.eye(4)
     camera[:3, :3] = [right / np.linalg.norm(right), -down / np.linalg.norm(down), -forward]
     camera[:3, 3] = -camera[:3, :3] @ view.eye_m
-    clip = np.zeros((4, 4))
-    clip[0] = 2 / view.width_px * pixels[0] - pixels[2]
-    clip[1] = pixels[2] - 2 / view.height_px * pixels[1]
-    clip[2] = (FAR_M + NEAR_M) / (FAR_M - NEAR_M) * pixels[2]
-    clip[2, 3] -= 2 * FAR_M * NEAR_M / (FAR_M - NEAR_M)
-    clip[3] = pixels[2]
+    clip = clip_from_stack(view, near_m=NEAR_M, far_m=FAR_M)
+    clip[1] *= -1  # programs draw with +y up
     matrices = {"view": camera, "projection": clip @ np.linalg.inv(camera)}
     return {"eye": SIDES[view.side], "eye_m": view.eye_m.tolist()} | {
         k: m.T.ravel().tolist() for k, m in matrices.items()

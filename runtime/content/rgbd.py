@@ -163,14 +163,7 @@ def _quads(depth: F32) -> I32:
     edges = (cv2.dilate(depth, kernel) - cv2.erode(depth, kernel) > TORN_RELATIVE).astype(np.uint8)
     cells = np.maximum.reduceat(np.maximum.reduceat(edges, down[:-1], axis=0), across[:-1], axis=1).astype(bool)
     i, j = np.nonzero(~cells)
-    large = np.column_stack(
-        [
-            down[i] * columns + across[j],
-            down[i + 1] * columns + across[j],
-            down[i] * columns + across[j + 1],
-            down[i + 1] * columns + across[j + 1],
-        ]
-    )
+    large = np.column_stack([down[i + below] * columns + across[j + right] for right in (0, 1) for below in (0, 1)])
     fine = np.repeat(np.repeat(cells, np.diff(down), axis=0), np.diff(across), axis=1)
     row, column = np.nonzero(fine)
     small = _corners(row, column, columns)
