@@ -67,16 +67,11 @@ def is_served(eyes_m: F64, stack: PanelStack) -> bool:
         eyes_m: The eyes' positions (2, 3) in the `stack` frame.
         stack: Geometry of the three panels.
     """
-    for eye in eyes_m:
-        edges = []
-        for x_m in stack.x_m:
-            t = (x_m - stack.x_m[CENTRE]) / (eye[0] - stack.x_m[CENTRE])
-            for half, axis in ((stack.width_m / 2, 1), (stack.height_m / 2, 2)):
-                edges.append((axis, (-half - eye[axis] * t) / (1 - t), (half - eye[axis] * t) / (1 - t)))
-        for axis, size_m in ((1, stack.width_m), (2, stack.height_m)):
-            low = max(edge[1] for edge in edges if edge[0] == axis)
-            high = min(edge[2] for edge in edges if edge[0] == axis)
-            if high - low < LEAST_COMMON * size_m:
+    for x_m, *aside_m in eyes_m:
+        t = (np.array(stack.x_m) - stack.x_m[CENTRE]) / (x_m - stack.x_m[CENTRE])
+        for size_m, eye_m in zip((stack.width_m, stack.height_m), aside_m, strict=True):
+            low, high = ((edge_m - eye_m * t) / (1 - t) for edge_m in (-size_m / 2, size_m / 2))
+            if high.min() - low.max() < LEAST_COMMON * size_m:
                 return False
     return True
 

@@ -55,10 +55,10 @@ class UNet(nn.Module):
     It has 17,303,721 parameters at width 32 and 4,329,561 at width 16.
     """
 
-    def __init__(self, width: int = 32, channels: int = 18, out: int = 9) -> None:
+    def __init__(self, width: int) -> None:
         super().__init__()
         w = width
-        self.in_conv = _block(channels, w, w)
+        self.in_conv = _block(18, w, w)
         self.down1, self.down2, self.down3, self.down4, self.down5 = (
             nn.Sequential(nn.MaxPool2d(2), _block(a, b, b))
             for a, b in ((w, 2 * w), (2 * w, 4 * w), (4 * w, 8 * w), (8 * w, 16 * w), (16 * w, 16 * w))
@@ -66,7 +66,7 @@ class UNet(nn.Module):
         self.up1, self.up2, self.up3, self.up4, self.up5 = (
             Up(a, b) for a, b in ((32 * w, 8 * w), (16 * w, 4 * w), (8 * w, 2 * w), (4 * w, w), (2 * w, w))
         )
-        self.out_conv = nn.Sequential(nn.Conv2d(w, out, 1))
+        self.out_conv = nn.Sequential(nn.Conv2d(w, 9, 1))
 
     def forward(self, x: Tensor) -> Tensor:
         """Map intensities (n, 18, h, w) to panel values (n, 9, h, w) before the sigmoid."""
