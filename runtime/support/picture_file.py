@@ -37,24 +37,20 @@ STILL_MS = 100.0  # duration used for an animation frame that declares 0, as in 
 DEEP = {"I;16": "<u2", "I;16L": "<u2", "I;16B": ">u2", "I;16N": "=u2"}  # Pillow's 16-bit modes
 
 
-def read_image(path: Path, *, background: Colour = WHITE) -> U8:
-    """Read the first picture in a file as 8-bit sRGB, shape (h, w, 3).
+def read_image(path: Path) -> U8:
+    """Read the first picture in a file as 8-bit sRGB, shape (h, w, 3), over white.
 
-    Args:
-        path: Picture file.
-        background: Colour behind transparent parts.
-
-    Raises:
-        InputError: The file cannot be read or decoded, or the picture has too many pixels. The number of pixels is
-            checked before decoding.
+    Raises InputError if the file cannot be read or decoded, or if the picture has too many pixels. The number of pixels
+    is checked before decoding.
     """
-    return read_views(path, background=background)[0]
+    return read_views(path)[0]
 
 
 def read_views(path: Path, *, background: Colour = WHITE) -> list[U8]:
     """Read the left and right eye's pictures from a stereo pair, or a single picture from any other file.
 
-    The pictures' format, the arguments and the exceptions are the same as for `read_image`.
+    The pictures' format and the exceptions are the same as for `read_image`. `background` is the colour
+    behind transparent parts.
     """
     data, header = read_coded(path)
     if header.warning:

@@ -160,21 +160,20 @@ def read_bytes(path: str | Path, *, most_bytes: int, source: str | Path = "", fi
     return data
 
 
-def read_text(path: str | Path, *, most_bytes: int = JSON_BYTES_MAX, source: str | Path = "", field: str = "") -> str:
-    """Read a UTF-8 text file. The arguments are the same as for `open_regular`.
+def read_text(path: str | Path, *, most_bytes: int = JSON_BYTES_MAX) -> str:
+    """Read a UTF-8 text file.
 
     Raises InputError if the file cannot be read, is larger than `most_bytes` or is not UTF-8.
     """
-    data = read_bytes(path, most_bytes=most_bytes, source=source, field=field)
-    return decoded(data, source=source or str(path), field=field)
+    return decoded(read_bytes(path, most_bytes=most_bytes), source=path)
 
 
-def decoded(data: bytes, *, source: str | Path, field: str = "") -> str:
+def decoded(data: bytes, *, source: str | Path) -> str:
     """Decode UTF-8 text and drop a byte-order mark. Raises InputError if the data are not UTF-8."""
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(source, field, f"is not valid UTF-8 at byte {error.start}") from None
+        raise InputError(source, "", f"is not valid UTF-8 at byte {error.start}") from None
 
 
 def read_json(path: str | Path, *, most_bytes: int = JSON_BYTES_MAX) -> Any:
