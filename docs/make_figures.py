@@ -52,7 +52,7 @@ def optics() -> Figure:
     stack = StackGeometry().stack()
     eyes = eyes_at(distance_m=0.6, height_m=0.05)
     with PairPainter("room", stack) as painter:
-        pair = painter.pair("room", eyes, stack, off_mm=())
+        pair = painter.pair("room", eyes, off_mm=())
     predictor = load_predictor("balanced", stack, ModelSettings())
     layers = np.array(solve_still(*pair.images, eyes_m=eyes, fov_deg=FOV_DEG, predictor=predictor).layers[..., :3])
     seen = [seen_by(eye, layers, stack, fov_deg=FOV_DEG).codes() for eye in eyes]
@@ -166,7 +166,7 @@ def draw_example() -> None:
     """Render the pictures used by `phasestack.example_pair`."""
     stack = replace(StackGeometry().stack(), width_px=640, height_px=360)
     with PairPainter(SCENE, stack) as painter:
-        pair = painter.pair(SCENE, np.array(EYES_M), stack, fov_deg=EXAMPLE_FOV_DEG, off_mm=())
+        pair = painter.pair(SCENE, np.array(EYES_M), fov_deg=EXAMPLE_FOV_DEG, off_mm=())
     for side, picture in zip(("left", "right"), pair.images, strict=True):
         write_png(IMAGES.parents[1] / "phasestack" / "data" / f"{side}.png", picture)
 

@@ -207,7 +207,7 @@ def look_into(folder: Path) -> None:
     stack = replace(StackGeometry().stack(), width_px=640, height_px=360)
     eyes = eyes_at(distance_m=0.65, angle_deg=4, height_m=0.08)
     with PairPainter("room", stack) as painter:
-        pair = painter.pair("room", eyes, stack, off_mm=())
+        pair = painter.pair("room", eyes, off_mm=())
     phasestack.solve(*pair.images, eyes_m=eyes, stack=stack).save(folder)
 
 

@@ -307,7 +307,7 @@ def test_a_refusal_of_the_model_names_it_once() -> None:
 def test_the_example_pair_shows_its_scene_and_is_a_case(tmp_path: Path) -> None:
     pair = phasestack.example_pair()
     with PairPainter("room", pair.stack) as painter:
-        drawn = painter.pair("room", pair.eyes_m, pair.stack, fov_deg=pair.fov_deg, off_mm=())
+        drawn = painter.pair("room", pair.eyes_m, fov_deg=pair.fov_deg, off_mm=())
     for given, image in zip((pair.left, pair.right), drawn.images, strict=True):
         assert np.abs(given.astype(int) - image).mean() < 0.05
     pair.save(tmp_path / "pair")

@@ -19,7 +19,7 @@ from runtime.config import StackGeometry, read_table, validated
 from runtime.evaluation.trials import timed
 from runtime.report.frontier import SHIPPED, Method, MethodResult, measure
 from runtime.report.page import describe
-from runtime.report.pairs import FOV_DEG, PairPainter, eyes_at
+from runtime.report.pairs import PairPainter, eyes_at
 
 SIZES = ((960, 540), (1920, 1080))
 WORSE_DB = 0.1  # minimum change that is reported; smaller ones can be caused by rounding and thread order
@@ -113,7 +113,7 @@ def measured(
     for width, height in sizes:
         stack = replace(StackGeometry().stack(), width_px=width, height_px=height)
         with PairPainter("demo", stack) as painter:
-            pair = painter.pair("demo", eyes_at(distance_m=0.6, height_m=0.05), stack, fov_deg=FOV_DEG, off_mm=())
+            pair = painter.pair("demo", eyes_at(distance_m=0.6, height_m=0.05), off_mm=())
         for done, result in measure(methods, [pair]):
             progress(f"{width}x{height}: finished {done}")
             yardsticks.append(yardstick_ms())

@@ -143,14 +143,14 @@ class PairPainter:
     """
 
     def __init__(self, scene: str | Scene, stack: PanelStack) -> None:
-        """Open a scene, given as an object or by the name of a built-in scene.
+        """Open a scene, given as an object or by the name of a built-in scene, for a stack's panels.
 
         Raises MissingPart if OpenGL or its Python package is not installed.
         """
         from runtime.content.procedural import ProceduralSource
         from runtime.support.gl import offscreen_context
 
-        self.context = offscreen_context()
+        self.stack, self.context = stack, offscreen_context()
         self.content = ProceduralSource(scene, stack=stack, context=self.context)
 
     def __enter__(self) -> PairPainter:
@@ -179,19 +179,16 @@ class PairPainter:
         projection = image_from_stack(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
         return np.ascontiguousarray(self.draw(eye_m, projection, width_px=width_px, height_px=height_px)[..., :3])
 
-    def pair(
-        self, name: str, eyes_m: F64, stack: PanelStack, *, fov_deg: float = FOV_DEG, off_mm: Sequence[float] = OFF_MM
-    ) -> StillPair:
-        """Draw a pair at a stack's resolution, with targets for displaced eyes.
+    def pair(self, name: str, eyes_m: F64, *, fov_deg: float = FOV_DEG, off_mm: Sequence[float] = OFF_MM) -> StillPair:
+        """Draw a pair at the panels' resolution, with targets for displaced eyes.
 
         Args:
             name: Pair name.
             eyes_m: Left and right eyes, shape (2, 3), in the `stack` frame.
-            stack: Panel geometry and resolution.
             fov_deg: The pictures' horizontal field of view.
             off_mm: Displacements. For each displacement, both eyes are moved right, up, left and down.
         """
-        size = {"width_px": stack.width_px, "height_px": stack.height_px}
+        size = {"width_px": self.stack.width_px, "height_px": self.stack.height_px}
         left, right = (self.image(eye, **size, fov_deg=fov_deg) for eye in eyes_m)
         off = tuple(
             OffView(mm, place, self.image(place, **size, fov_deg=fov_deg))
@@ -199,7 +196,7 @@ class PairPainter:
             for eye in eyes_m
             for place in beside(eye, mm)
         )
-        return StillPair(name, stack, eyes_m, (left, right), fov_deg, off)
+        return StillPair(name, self.stack, eyes_m, (left, right), fov_deg, off)
 
 
 PROCEDURAL = (
@@ -213,5 +210,5 @@ def procedural_pairs(stack: PanelStack) -> Iterator[StillPair]:
     """Draw the report's built-in pairs, which show two scenes from a total of three positions."""
     for scene, name, place in PROCEDURAL:
         with PairPainter(scene, stack) as painter:
-            pair = painter.pair(name, eyes_at(**place), stack)
+            pair = painter.pair(name, eyes_at(**place))
         yield pair

@@ -27,7 +27,7 @@ STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 192, 108)
 @pytest.fixture(scope="module")
 def pair() -> StillPair:
     with PairPainter("demo", STACK) as painter:
-        return painter.pair("demo", eyes_at(distance_m=0.6), STACK, off_mm=(2, 6))
+        return painter.pair("demo", eyes_at(distance_m=0.6), off_mm=(2, 6))
 
 
 def test_the_judgement_is_that_of_the_optics(pair: StillPair) -> None:

@@ -96,7 +96,7 @@ def test_places_beside_an_eye_lie_in_its_image_plane() -> None:
 def test_a_built_in_pair_has_new_views_beside_its_eyes() -> None:
     stack = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 96, 54)
     with PairPainter("demo", stack) as painter:
-        pair = painter.pair("demo", eyes_at(distance_m=0.6), stack, off_mm=(2, 6))
+        pair = painter.pair("demo", eyes_at(distance_m=0.6), off_mm=(2, 6))
         np.testing.assert_array_equal(painter.image(pair.off[0].eye_m, width_px=96, height_px=54), pair.off[0].image)
     assert len(pair.off) == 2 * 2 * 4
     assert (pair.images[0] != pair.images[1]).any()
