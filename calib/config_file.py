@@ -87,9 +87,7 @@ def rewrite(config: Path, change: Callable[[TOMLDocument], None]) -> Path | None
 
 def put(document: TOMLDocument, section: str, values: Mapping[str, Any]) -> None:
     """Set keys in a section's table. The table is created if the document has no such section."""
-    table: Any = document.setdefault(section, tomlkit.table())
-    for key, value in values.items():
-        table[key] = value
+    document.setdefault(section, tomlkit.table()).update(values)
 
 
 def put_panels(document: TOMLDocument, key: str, values: Mapping[int, Any], *, panels: int) -> None:
@@ -125,8 +123,7 @@ def put_monitors(document: TOMLDocument, tables: Sequence[Mapping[str, Any]]) ->
     for values in tables:
         same = next((old for old in past if all(old.get(k, _DEFAULTS.get(k)) == v for k, v in values.items())), {})
         table = tomlkit.table()
-        for key, value in ({**same, **values}).items():
-            table[key] = value
+        table.update({**same, **values})
         panels.append(table)
     if "panels" in output:
         del output["panels"]

@@ -33,10 +33,7 @@ def bench(
         record = benchmark.measured(progress=tell)
     if out is not None:
         write_json(out, record)
-    if as_json:
-        print(to_json(record))
-        return
-    print("\n".join(lines_of(record)))
+    print(to_json(record) if as_json else "\n".join(lines_of(record)))
 
 
 @app.command()
