@@ -116,7 +116,8 @@ def examine(settings: Settings) -> list[Row]:
     If a check raises an unexpected exception, its row is marked as failed and the other checks still run.
     """
     rows: list[Row] = []
-    for name, check in CHECKS.items():
+    for check in CHECKS:
+        name = check.__name__
         try:
             rows += check(settings)
         except PhasestackError as error:
@@ -361,13 +362,4 @@ def _daemon(settings: Settings) -> dict[str, Any] | None:
         return None
 
 
-CHECKS: dict[str, Check] = {
-    "opengl": opengl,
-    "monitors": monitors,
-    "usb": usb,
-    "sensor": sensor,
-    "calibration": calibration,
-    "content": content,
-    "model": model,
-    "service": service,
-}
+CHECKS: tuple[Check, ...] = (opengl, monitors, usb, sensor, calibration, content, model, service)

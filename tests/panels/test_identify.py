@@ -134,7 +134,7 @@ def test_without_a_screen_it_says_so_in_one_line(monkeypatch: pytest.MonkeyPatch
 
 @pytest.mark.windows
 def test_the_doctor_lists_monitors_and_their_binding(x: XServer, config: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("runtime.commands.doctor.CHECKS", {"monitors": monitors})
+    monkeypatch.setattr("runtime.commands.doctor.CHECKS", (monitors,))
     checks = json.loads(invoke(doctor, "--json", "--config", config).stdout)["checks"]
     assert any("A1B2-0003" in check["detail"] for check in checks if check["name"] == "monitor")
     assert [check["state"] for check in checks if check["name"] == "panels"] == ["ok"] * 3
@@ -145,7 +145,7 @@ def test_the_doctor_lists_monitors_and_their_binding(x: XServer, config: Path, m
 def test_the_doctor_names_a_panel_whose_monitor_is_missing(
     x: XServer, config: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("runtime.commands.doctor.CHECKS", {"monitors": monitors})
+    monkeypatch.setattr("runtime.commands.doctor.CHECKS", (monitors,))
     config.write_text(BOUND.replace("A1B2-0003", "ANOTHER"))
     result = invoke(doctor, "--json", "--config", config)
     failed = {check["name"]: check for check in json.loads(result.stdout)["checks"] if check["state"] == "fail"}
