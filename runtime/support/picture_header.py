@@ -112,12 +112,12 @@ def _formats() -> tuple[str, ...]:
     return (*FORMATS, "HEIF")
 
 
-def _header_of(path: Path, coded: bytes | IO[bytes]) -> Header:
+def _header_of(path: Path, file: IO[bytes]) -> Header:
     """Read a picture's header.
 
     Args:
         path: Picture file. A second picture of undefined type counts as an eye's view only if the suffix is .mpo.
-        coded: The file's content, or the open file.
+        file: The open file.
 
     Raises:
         InputError: The file is a camera's raw picture, the header cannot be decoded, or the picture has too many
@@ -126,28 +126,26 @@ def _header_of(path: Path, coded: bytes | IO[bytes]) -> Header:
     if path.suffix.lower() in RAW:  # many raw files are TIFFs, and Pillow would show only their thumbnails
         raise InputError(path, "", "is {}, which is not supported; {}".format(*RAW_KIND))
     try:
-        with opened(coded) as image:
+        with opened(file) as image:
             width, height = image.size
             if _orientation(image) in TURNED:
                 width, height = height, width
             is_animated = image.format in ANIMATED and bool(getattr(image, "is_animated", False))
             views, warning = _views(image, is_named_so=path.suffix.lower() == ".mpo")
             is_around, layout, other = b"equirectangular" in _xmp(image), _jps_layout(image), None
-            if image.format == "JPEG" and (found := _leia_view(coded, image.size)):
+            if image.format == "JPEG" and (found := _leia_view(file, image.size)):
                 other, views = found[0], (1, 0) if found[1] else (0, 1)
             kind = image.format
-        head = _beginning(coded, HEAD_BYTES)
+        head = _beginning(file, HEAD_BYTES)
     except Exception as error:  # the class of the exception depends on Pillow's format
-        raise InputError(path, "", undecodable(_beginning(coded, LIMITS.file_bytes), error)) from None
+        raise InputError(path, "", undecodable(_beginning(file, LIMITS.file_bytes), error)) from None
     check_size(width, height, source=path, head=head)
     return Header(kind, width, height, views, is_animated, is_around, warning, layout, other)
 
 
-def _beginning(coded: bytes | IO[bytes], most_bytes: int) -> bytes:
-    if isinstance(coded, bytes):
-        return coded[:most_bytes]
-    coded.seek(0)
-    return coded.read(most_bytes)
+def _beginning(file: IO[bytes], most_bytes: int) -> bytes:
+    file.seek(0)
+    return file.read(most_bytes)
 
 
 def _views(image: Any, *, is_named_so: bool) -> tuple[tuple[int, ...], str]:
@@ -184,14 +182,13 @@ def _views(image: Any, *, is_named_so: bool) -> tuple[tuple[int, ...], str]:
     return ((1, 0) if _viewpoint(image) == 1 else (0, 1)), ""
 
 
-def _leia_view(coded: bytes | IO[bytes], size: tuple[int, int]) -> tuple[slice, bool] | None:
+def _leia_view(file: IO[bytes], size: tuple[int, int]) -> tuple[slice, bool] | None:
     """Return the result of `other_view`, or None if the second view is not a picture of the given size.
 
     Args:
-        coded: Encoded picture, as bytes or as an open file.
+        file: The open picture file.
         size: The first view's width and height.
     """
-    file = io.BytesIO(coded) if isinstance(coded, bytes) else coded
     if found := other_view(file):
         file.seek(found[0].start)
         with suppress(ValueError):
@@ -402,7 +399,7 @@ def read_coded(path: Path) -> tuple[bytes, Header]:
     if untrusted_input.is_there(path, folder=True) and (problem := camera_set_in(path)):
         raise InputError(path, "", problem)
     data = untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)
-    return data, _header_of(path, data)
+    return data, _header_of(path, io.BytesIO(data))
 
 
 def header_of_file(path: Path) -> Header:
