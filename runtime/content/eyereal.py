@@ -142,7 +142,7 @@ class EyeRealSource(ContentSource):
             picture, projection = self._loaded(self._chosen)[view.side]
         except InputError as error:
             raise ContentFailure(str(error)) from None
-        matrix = image_from_view(projection, view.pixels_from_stack, x_m=0.0)
+        matrix = image_from_view(projection, view.pixels_from_stack)
         return picture.warped(matrix, view)
 
     def _load(self, index: int) -> list[tuple[WarpedPicture, F64]]:

@@ -21,21 +21,20 @@ def rgba_from_rgb(rgb: U8) -> U8:
     return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA))
 
 
-def image_from_view(image_from_stack: F64, pixels_from_stack: F64, *, x_m: float) -> F64 | None:
-    """Return the 3x3 homography from a view's pixels to those of a picture shown on a plane.
+def image_from_view(image_from_stack: F64, pixels_from_stack: F64) -> F64 | None:
+    """Return the 3x3 homography from a view's pixels to those of a picture shown on the plane x = 0.
 
-    If the picture and the view belong to the same eye position, it does not matter which plane is chosen.
+    If the picture and the view belong to the same eye position, any other plane would give the same result.
 
     Args:
         image_from_stack: Projection (3, 4) to the picture's pixels.
         pixels_from_stack: Projection (3, 4) to the view's pixels.
-        x_m: The plane is x = `x_m` in frame `stack`.
 
     Returns:
         The homography, or None if the view's eye is in the plane.
     """
     # This raster's pixel coordinates are metres along y (u) and -z (v).
-    plane = PlaneRaster(x_m=x_m, left_m=0.0, top_m=0.0, pitch_u_m=1.0, pitch_v_m=1.0, width_px=1, height_px=1)
+    plane = PlaneRaster(x_m=0.0, left_m=0.0, top_m=0.0, pitch_u_m=1.0, pitch_v_m=1.0, width_px=1, height_px=1)
     plane_from_view = plane_from_pixels(pixels_from_stack, plane)
     return None if plane_from_view is None else image_from_raster(image_from_stack, plane) @ plane_from_view
 

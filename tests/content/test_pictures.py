@@ -247,7 +247,7 @@ def test_a_picture_much_larger_than_the_raster_is_averaged(stack: PanelStack) ->
     lines[:, ::2] = 255
     view = panel_view((0.7, -0.03, 0.1), stack.panel(1))
     projection = image_from_stack(view.eye_m, width_px=1920, height_px=1080, fov_deg=60)
-    matrix = image_from_view(projection, view.pixels_from_stack, x_m=0.0)
+    matrix = image_from_view(projection, view.pixels_from_stack)
     picture = WarpedPicture(rgba_from_rgb(lines), background=(1.0, 1.0, 1.0)).warped(matrix, view)
     inner = picture[60:-60, 60:-60, 0].astype(int)
     assert np.abs(inner - 128).max() < 32
