@@ -14,7 +14,7 @@ from calib.viewpoints import viewing_volume_m
 from runtime.config import CalibrationSettings, read_table, validated
 from runtime.eyes.calibration import Calibration, Lenient, Vector3, load_calibration, similarity_defect
 from runtime.records import F64
-from runtime.report.page import Figure, Page, PageSection, drawing, png, section_of
+from runtime.report.page import Figure, Page, PageSection, Table, drawing, png
 from runtime.support.figures import in_words
 
 COLOURS = {"X": "#c0392b", "Y": "#27803b", "Z": "#2260a8"}
@@ -64,7 +64,7 @@ def write_report(file: Path, out: Path, *, viewing: CalibrationSettings) -> dict
     points = _stored_points(table.get("data"), calibration, source=file)
     summary = _summary(calibration, points, viewing_volume_m(viewing))
     rows = [[name, text] for name, value in summary.items() if (text := in_words(value))]
-    sections = [section_of("Numbers", [["", ""], *rows])]
+    sections = [PageSection("Numbers", tables=[Table(["", ""], rows)])]
     notes = [*calibration.warnings]
     if isinstance(table.get("warnings"), list):
         notes += [str(text) for text in table["warnings"]]
@@ -73,11 +73,11 @@ def write_report(file: Path, out: Path, *, viewing: CalibrationSettings) -> dict
     else:
         text = "X, Y and Z error of every calibration point (the EyeReal supplement's figure S5)"
         figure = Figure("residuals", residual_figure(points, limit_m=RESIDUAL_LIMIT_M), text)
-        sections += [PageSection("Pictures", figures=[figure]), section_of("Points", _point_rows(points))]
+        sections += [PageSection("Pictures", figures=[figure]), PageSection("Points", tables=[_point_table(points)])]
     if calibration.file.covariance is None:
         notes.append("This file contains no covariance, so the error at the eye is unknown.")
     lead = "Pose of the depth camera relative to the stack of panels, with its uncertainty."
-    Page(f"Calibration {file.name}", lead, sections, notes=notes).write(out, record="report.json", data=summary)
+    Page(f"Calibration {file.name}", lead, sections, notes=notes).write(out, data=summary)
     return summary
 
 
@@ -151,9 +151,9 @@ def _summary(calibration: Calibration, points: Points | None, volume_m: F64) -> 
     return found
 
 
-def _point_rows(points: Points) -> list[list[str]]:
-    rows = [["", "point", "X error, mm", "Y error, mm", "Z error, mm", "distance, mm", ""]]
+def _point_table(points: Points) -> Table:
+    rows = []
     for number, (name, error, used) in enumerate(zip(points.names, points.residual_m * 1e3, points.used, strict=True)):
         cells = [f"{value:.2f}" for value in (*error, np.linalg.norm(error))]
         rows.append([str(number + 1), name, *cells, "" if used else "rejected"])
-    return rows
+    return Table(["", "point", "X error, mm", "Y error, mm", "Z error, mm", "distance, mm", ""], rows)

@@ -65,7 +65,7 @@ class GrowingPage:
         sections, machine = list(self._sections.values()), self.record["machine"]
         lead = "The figure to quote is the light at a tracking error of 1 mm (higher is better)."
         page = Page("Light against run time", lead, sections, machine, self._command, notes)
-        page.write(self.out, record="report.json", data=self.record)
+        page.write(self.out, data=self.record)
 
 
 def whole_report(

@@ -79,29 +79,23 @@ class Page:
         """Return all figures on the page, in order of appearance."""
         return [figure for section in self.sections for figure in section.figures]
 
-    def write(self, out: Path, *, record: str, data: Any) -> None:
-        """Write index.html, the pictures and the data to a folder.
+    def write(self, out: Path, *, data: Any) -> None:
+        """Write index.html, the pictures and report.json, which stores the data, to a folder.
 
         Either all files appear in the folder or none does.
 
         Args:
             out: Folder to write to; created if necessary.
-            record: Name of the JSON file that stores the data.
-            data: Contents of the JSON file.
+            data: Contents of report.json.
 
         Raises:
             InputError: The files cannot be written.
         """
         with OutputFolder(out) as folder:
-            write_json(folder.staging / record, data)
+            write_json(folder.staging / "report.json", data)
             write_text(folder.staging / "index.html", self.html())
             for figure in self.figures():
                 write_bytes(folder.staging / f"{figure.name}.png", figure.png)
-
-
-def section_of(title: str, rows: Sequence[Sequence[str]]) -> PageSection:
-    """Create a section with one table. The first row contains the headings."""
-    return PageSection(title, tables=[Table(rows[0], rows[1:])])
 
 
 @contextmanager
