@@ -9,8 +9,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from runtime.records import F32, F64
 
@@ -83,7 +81,14 @@ def solid_winding(shape: Shape) -> int:
     begin, end = corners.reshape(-1), corners[:, [1, 2, 0]].reshape(-1)
     if not np.array_equal(np.sort(begin * count + end), np.sort(end * count + begin)):
         return 0  # an edge is not passed as often in one direction as in the other
-    body = connected_components(coo_array((np.ones(begin.size, bool), (begin, end)), (count, count)))[1]
+    body = np.arange(count)
+    while True:  # the smallest vertex number spreads over each body
+        before = body
+        body = before.copy()
+        np.minimum.at(body, corners.reshape(-1), np.repeat(before[corners].min(1), 3))
+        body = body[body]
+        if np.array_equal(body, before):
+            break
     points = (shape.positions_m - shape.positions_m.mean(0)).astype(np.float64)[triangles]
     volumes = (points[:, 0] * np.cross(points[:, 1], points[:, 2])).sum(1)
     of_body = np.bincount(body[corners[:, 0]], volumes, count)[np.unique(body[corners])]
@@ -193,22 +198,24 @@ def box(size_m: Sequence[float]) -> Shape:
     return join([card(*face).moved(turn, turn @ [depth / 2, 0.0, 0.0]) for turn, face, depth in turns])
 
 
-def sphere(radius_m: float) -> Shape:
-    """Return a sphere of 48 x 24 segments centred on the origin, with its poles on the z axis."""
-    s, t, triangles = _grid(np.linspace(0, 1, 49), np.linspace(0, 1, 25))
+def sphere(radius_m: float, *, columns: int = 48, rows: int = 24) -> Shape:
+    """Return a sphere centred on the origin, with its poles on the z axis."""
+    s, t, triangles = _grid(np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1))
     longitude, polar = s * 2 * np.pi, t * np.pi
     normal = np.column_stack([np.cos(longitude) * np.sin(polar), np.sin(longitude) * np.sin(polar), np.cos(polar)])
     return _shape(normal * radius_m, normal, np.column_stack([2 * s, t]), triangles)
 
 
-def torus(radius_m: float, tube_m: float) -> Shape:
-    """Return a torus around the x axis, with 64 segments around the axis and 24 around the tube.
+def torus(radius_m: float, tube_m: float, *, columns: int = 64, rows: int = 24) -> Shape:
+    """Return a torus around the x axis.
 
     Args:
         radius_m: Distance from the torus's centre to the centre of the tube.
         tube_m: Tube radius.
+        columns: Number of segments around the axis.
+        rows: Number of segments around the tube.
     """
-    s, t, triangles = _grid(np.linspace(0, 1, 65), np.linspace(0, 1, 25))
+    s, t, triangles = _grid(np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1))
     around, across = s * 2 * np.pi, t * 2 * np.pi
     normal = np.column_stack([np.sin(across), np.cos(around) * np.cos(across), np.sin(around) * np.cos(across)])
     centre = np.column_stack([0 * around, np.cos(around), np.sin(around)]) * radius_m
