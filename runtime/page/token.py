@@ -46,10 +46,11 @@ def _read(path: Path) -> str:
         file = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK)
     except OSError as error:
         raise InputError(path, "", f"cannot be read: {error.strerror}") from None
+    status = os.fstat(file)
+    if not stat.S_ISREG(status.st_mode):
+        os.close(file)  # `fdopen` does not open folders
+        raise InputError(path, "", "is not a regular file")
     with os.fdopen(file, "rb") as opened:
-        status = os.fstat(opened.fileno())
-        if not stat.S_ISREG(status.st_mode):
-            raise InputError(path, "", "is not a regular file")
         if status.st_uid != os.geteuid():
             raise InputError(
                 path, "", f"belongs to another user (uid {status.st_uid}) who may know the token; delete the file"

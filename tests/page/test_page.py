@@ -273,6 +273,11 @@ def test_a_token_file_that_is_none_is_refused(tmp_path: Path, text: str, mode: i
         token_of(path)
 
 
+def test_a_folder_in_place_of_the_token_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="is not a regular file"):
+        token_of(tmp_path)
+
+
 @pytest.mark.parametrize("option", ["--config", "--port"])
 def test_bad_options_are_one_line_and_exit_2(tmp_path: Path, option: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("runtime.support.background.set_niceness", lambda niceness: None)  # of this very process
