@@ -20,6 +20,7 @@ from runtime.config import Settings, with_options
 from runtime.daemon import supervise
 from runtime.daemon.build import RunOptions
 from runtime.daemon.drive import drive
+from runtime.errors import InputError
 from runtime.evaluation.run_output import RunOutput
 from runtime.eyes.calibration import demo_sensor_from_stack
 from runtime.eyes.motions import true_eyes
@@ -29,7 +30,7 @@ from runtime.sensor.recording import Recording, recording_to
 from runtime.sensor.recording_format import RecordingHeader
 from runtime.sensor.replay import demo_recording_path
 from runtime.support.picture_file import read_image
-from tests.test_cli import phasestack
+from tests.test_cli import phasestack, refusal
 from tests.waiting import PATIENT
 
 FRAMES = 60
@@ -256,6 +257,20 @@ def test_the_demo_ends_in_time_and_names_its_simulated_clock(tmp_path: Path, mon
     assert summary["frames"] == 4 and summary["light_db"] and "reached the time limit of" in summary["stopped"]
     assert (summary["clock"], summary["scene"]) == ("simulated", "room")
     assert list(summary)[:2] == ["clock", "configured"]
+
+
+def test_a_run_that_could_not_write_its_files_does_not_end_well(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(path: Path, data: Any) -> None:
+        raise InputError(path, "", "cannot be written: No space left on device")
+
+    monkeypatch.setattr("runtime.evaluation.run_output.write_json", full)
+    told = refusal("demo", "--frames", "1", "--out", tmp_path / "out")
+    assert told == f"{tmp_path / 'out' / 'summary.json'}: cannot be written: No space left on device"
+    assert "contact-sheet.png" not in capsys.readouterr().out and not (tmp_path / "out").exists()
+    monkeypatch.setattr(supervise, "run_daemon", lambda *_: {"output_problem": "why"})
+    assert refusal("run", "--json", "--out", tmp_path / "out") == "why"
 
 
 def test_the_demo_recording_begins_anew_unless_it_is_told_how_long(

@@ -29,7 +29,7 @@ def demo(
     """
     from runtime.config import Settings, changed
     from runtime.daemon.build import Host, RunOptions
-    from runtime.daemon.drive import drive, print_summary
+    from runtime.daemon.drive import drive, print_summary, refuse_lost_output
 
     class InTime(Host):
         """Host that ends the demo after a time limit on slow machines."""
@@ -51,3 +51,4 @@ def demo(
         typer.echo(json.dumps(summary))
     else:
         print_summary(summary, out)
+    refuse_lost_output(summary)

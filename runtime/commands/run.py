@@ -57,7 +57,7 @@ def run(
     """
     from runtime.config import Settings, load_settings, with_options
     from runtime.daemon.build import RunOptions
-    from runtime.daemon.drive import print_summary
+    from runtime.daemon.drive import print_summary, refuse_lost_output
     from runtime.daemon.supervise import run_daemon
     from runtime.errors import InputError
 
@@ -87,3 +87,4 @@ def run(
         typer.echo(json.dumps(summary))
     elif "frames" in summary and "NOTIFY_SOCKET" not in os.environ:
         print_summary(summary, out)
+    refuse_lost_output(summary)

@@ -11,6 +11,7 @@ import numpy as np
 from runtime.browser.still import viewer_html
 from runtime.config import Settings
 from runtime.daemon.build import Host, Run, RunOptions, build_run
+from runtime.errors import FatalError
 from runtime.evaluation.run_output import RunOutput
 from runtime.optics.alignment import shown_layers
 from runtime.records import U8, RefreshAccount
@@ -23,7 +24,10 @@ USUAL_M, IPD_M = 0.6, 0.063  # a typical viewer's distance and eye separation, u
 
 
 def drive(settings: Settings, options: RunOptions, host: Host | None = None) -> dict[str, Any]:
-    """Build a run, run the display loop to its end, write the output files and return the summary."""
+    """Build a run, run the display loop to its end, write the output files and return the summary.
+
+    If the output files could not be written, `output_problem` in the returned summary gives the reason.
+    """
     done = 0
 
     def advance(account: RefreshAccount) -> None:
@@ -54,6 +58,8 @@ def drive(settings: Settings, options: RunOptions, host: Host | None = None) -> 
             if last is not None and layers is not None and moment is None:
                 unseen = _unseen(layers, last.account, run, settings)
             output.finish(summary, layers, moment, unseen=unseen)
+    if output is not None and output.problem:
+        summary["output_problem"] = output.problem
     wait_for_all(JOBS_END_WITHIN_S)
     return summary
 
@@ -91,5 +97,11 @@ def print_summary(summary: dict[str, Any], out: Path | None) -> None:
         )
     if not summary["inferences"]:
         print("no solution was shown because no viewer was seen or because --frames ended the run too early")
-    if out is not None:
+    if out is not None and "output_problem" not in summary:
         print(f"see {out}/contact-sheet.png, or open {out}/viewer.html to look around")
+
+
+def refuse_lost_output(summary: dict[str, Any]) -> None:
+    """Raise FatalError if the files for --out could not be written."""
+    if problem := summary.get("output_problem"):
+        raise FatalError(problem)

@@ -200,6 +200,7 @@ class RunOutput:
     def _abandon(self, why: str, *, trace: bool) -> None:
         if self.problem:
             return
+        why = why.replace(str(self._folder.staging), str(self._target))  # name the final file, not the staged one
         self.problem = why
         log.warning("output: abandoned without writing to %s: %s", self._target, why, exc_info=trace)
         self._folder.discard()  # immediately, because the files may be filling the disk
