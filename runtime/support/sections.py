@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 import tomllib
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, ValidationError, ValidationInfo, field_validator
 
 from runtime.errors import InputError, one_line
 from runtime.support import untrusted_input
@@ -25,7 +25,8 @@ M = TypeVar("M", bound=BaseModel)
 class Section(BaseModel):
     """Base class for the records that tables are validated against.
 
-    Records are frozen. Unknown keys, non-finite numbers and strings that are not valid names or paths are rejected.
+    Records are frozen. Unknown keys, non-finite numbers, true and false in place of numbers, and strings that are not
+    valid names or paths are rejected.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -34,6 +35,30 @@ class Section(BaseModel):
     @classmethod
     def _check_text(cls, value: Any) -> Any:
         return check_text(value) if isinstance(value, str) else value
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _refuse_truth(cls, value: Any, info: ValidationInfo) -> Any:
+        annotation = cls.model_fields[str(info.field_name)].annotation
+        kinds = get_args(annotation)[1:] if get_origin(annotation) is dict else (annotation,)
+        return _spelt(value) if _takes_numbers(kinds) else value
+
+
+def _takes_numbers(kinds: tuple[Any, ...]) -> bool:
+    """Return True if the types, or those they are made of, include numbers but neither booleans nor any text."""
+    parts = [*kinds]
+    for part in parts:  # the list grows
+        parts += get_args(part)
+    return (int in parts or float in parts) and not any(kind in parts for kind in (bool, str, Any))
+
+
+def _spelt(value: Any) -> Any:
+    """Spell out all booleans, because pydantic would convert them to 1 and 0 but refuses these words as numbers."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list | tuple):
+        return [_spelt(item) for item in value]
+    return {key: _spelt(item) for key, item in value.items()} if isinstance(value, dict) else value
 
 
 def read_table(path: Path) -> dict[str, Any]:
