@@ -100,6 +100,8 @@ def _refuse_target(out: Path, *, motion: bool) -> None:
         raise InputError(out, "--out", "is a folder; pass the name of a file")
     if not os.path.lexists(out):
         folder = next(folder for folder in out.absolute().parents if os.path.lexists(folder))
+        if not os.path.isdir(folder):  # noqa: PTH112
+            raise InputError(out, "--out", f"cannot be written: {folder} is not a folder")
         if not os.access(folder, os.W_OK | os.X_OK):
             raise InputError(out, "--out", "cannot be written: Permission denied")
         return

@@ -140,6 +140,12 @@ def test_a_forbidden_place_is_refused_in_one_line(folder: str) -> None:
     assert "cannot be written: Permission denied" in str(answer.exception)
 
 
+def test_a_file_where_the_folder_should_be_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    answer = CliRunner().invoke(app, ["--motion", "still", "--out", str(tmp_path / "file" / "a.mcap")])
+    assert f"{tmp_path / 'file'} is not a folder" in str(answer.exception)
+
+
 def test_images_of_a_sensor_that_has_none_are_not_claimed(tmp_path: Path) -> None:
     answer = CliRunner().invoke(app, ["--images", "--seconds", "0.5", "--out", str(tmp_path / "a.mcap")])
     assert answer.exit_code == 0 and "eyes" in answer.stdout
