@@ -54,6 +54,8 @@ PANEL = '[[output.panels]]\nconnector = "DP-{}"\n'
         ("[modle]\nname = 'fast'", "modle", "did you mean model?"),
         ("[[output.panels]]\nedid_seril = 'A'", "output.panels.0.edid_seril", "did you mean edid_serial?"),
         ("[loop]\nzebra = 1", "loop.zebra", "is not a setting"),
+        ("[content]\nscene = ''", "content.scene", "at least 1 character"),
+        ("[model]\nname = ''", "model.name", "at least 1 character"),
         ("[loop]\nrate_hz = true", "loop.rate_hz", "valid number"),
         ("[stack]\nx_m = [-0.06, false, 0.06]", "stack.x_m.1", "valid number"),
         ("[stack]\ntilt = [[0, 0], [0, true], [0, 0]]", "stack.tilt.1.1", "valid number"),

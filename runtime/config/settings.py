@@ -191,7 +191,9 @@ class ContentSettings(Section):
     """The content and its placement."""
 
     scene: NameOrPath = Field(
-        "demo", description="a built-in scene, a preset, a file, a folder, or `module:Class` for your own class"
+        "demo",
+        min_length=1,
+        description="a built-in scene, a preset, a file, a folder, or `module:Class` for your own class",
     )
     options: dict[str, Any] = Field(
         default_factory=dict, description="options for a scene given as a class (the scene `program` accepts `port`)"
@@ -265,7 +267,7 @@ class ModelSettings(Section):
     """The model, and the device to run it on."""
 
     name: NameOrPath = Field(
-        "balanced", description="fast, balanced, best, sart, or an ONNX file exported by phasestack"
+        "balanced", min_length=1, description="fast, balanced, best, sart, or an ONNX file exported by phasestack"
     )
     effort: Literal["auto", "full"] = Field(
         "auto",

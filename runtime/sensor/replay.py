@@ -40,7 +40,12 @@ class ReplayDriver(SteppedSensor):
             clock: The run's clock. Capture times are shifted to it.
             loop: Start again at the end of the recording.
             latency_ms: Each sample's delay from capture to arrival.
+
+        Raises:
+            InputError: The path is empty.
         """
+        if not source:
+            raise InputError("sensor", "source", "is empty; name a recording, or `demo`")
         self.path, self._loop = demo_recording_path() if source == "demo" else Path(source), loop
         super().__init__(str(self.path), clock, latency_ms=latency_ms)
         self.capabilities = Capabilities(eye_points=True, may_pause=True)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from runtime.clock import NS_PER_S, MonotonicClock, SimulatedClock
-from runtime.errors import EndOfRecording, SensorLost, SensorTimeout
+from runtime.errors import EndOfRecording, InputError, SensorLost, SensorTimeout
 from runtime.records import SensorFrame
 from runtime.sensor.recording import Recording
 from runtime.sensor.replay import ReplayDriver, demo_recording_path
@@ -65,6 +65,11 @@ def test_a_loop_goes_on_evenly_and_counts_on() -> None:
     assert [f.sequence for f in frames] == list(range(1, 401))
     steps = {b.capture_ns - a.capture_ns for a, b in pairwise(frames)}
     assert max(steps) - min(steps) <= 1
+
+
+def test_an_empty_name_is_refused_with_its_setting() -> None:
+    with pytest.raises(InputError, match="sensor: source: is empty"):
+        ReplayDriver("", SimulatedClock())
 
 
 def test_it_can_be_opened_again_and_closed_twice() -> None:
