@@ -24,15 +24,24 @@ def bench(
     """
     if context.invoked_subcommand is not None:
         return
+    from contextlib import ExitStack
+
+    from runtime.errors import InputError
     from runtime.report import benchmark
-    from runtime.support.artifacts import to_json, write_json
+    from runtime.support.artifacts import OutputFolder, to_json, write_json
     from runtime.support.figures import lines_of
     from runtime.support.progress import status_line
 
-    with status_line("bench") as tell:
-        record = benchmark.measured(progress=tell)
-    if out is not None:
-        write_json(out, record)
+    with ExitStack() as cleanup:
+        folder = None
+        if out is not None:  # refuse an unusable name before the measurement, not after it
+            if out.is_dir():
+                raise InputError(out, "--out", "is a folder; pass the name of a file")
+            folder = cleanup.enter_context(OutputFolder(out.parent))
+        with status_line("bench") as tell:
+            record = benchmark.measured(progress=tell)
+        if out is not None and folder is not None:
+            write_json(folder.staging / out.name, record)
     print(to_json(record) if as_json else "\n".join(lines_of(record)))
 
 

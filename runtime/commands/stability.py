@@ -28,6 +28,7 @@ def stability(
     Example: phasestack stability --out stability
     """
     import time
+    from contextlib import ExitStack
     from dataclasses import asdict
 
     from runtime.report.page import describe
@@ -37,13 +38,14 @@ def stability(
 
     started = time.perf_counter()
     trials = list(suite.every_trial(_fits(), full=full))
-    with progress_bar("stability") as tell:
-        cases = suite.run(trials, record=record, progress=tell)
-    seconds = time.perf_counter() - started
-    failed = [case for case in cases if not case.passed]
-    result = {"cases": [asdict(case) for case in cases], "machine": describe(), "seconds": round(seconds, 1)}
-    if out is not None:
-        with OutputFolder(out) as folder:
+    with ExitStack() as cleanup:
+        folder = None if out is None else cleanup.enter_context(OutputFolder(out))  # refused before any case has run
+        with progress_bar("stability") as tell:
+            cases = suite.run(trials, record=record, progress=tell)
+        seconds = time.perf_counter() - started
+        failed = [case for case in cases if not case.passed]
+        result = {"cases": [asdict(case) for case in cases], "machine": describe(), "seconds": round(seconds, 1)}
+        if folder is not None:
             write_json(folder.staging / "stability.json", result)
     if as_json:
         print(to_json(result))

@@ -86,6 +86,23 @@ def test_the_command_exits_with_1_only_where_something_got_worse(tmp_path: Path)
     assert json.loads(shown.stdout)["worse"] == 1
 
 
+@pytest.mark.parametrize("out", ["", "file/bench.json"])
+def test_an_unusable_output_is_refused_before_the_measurement(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, out: str
+) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    monkeypatch.setattr(benchmark, "measured", lambda **_: pytest.fail("measured first"))
+    answer = CliRunner().invoke(app, ["--out", str(tmp_path / out)])
+    assert isinstance(answer.exception, InputError)
+
+
+def test_the_measurement_is_written_where_it_was_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(benchmark, "measured", lambda **_: regression_file())
+    out = tmp_path / "new" / "bench.json"
+    assert CliRunner().invoke(app, ["--out", str(out), "--json"]).exit_code == 0
+    assert json.loads(out.read_text()) == regression_file() and [*out.parent.iterdir()] == [out]
+
+
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [

@@ -75,6 +75,13 @@ def test_a_failing_case_makes_the_command_exit_with_1(tmp_path: Path, monkeypatc
     assert any(case["passed"] for case in cases), "what does not use the bent pose still passes"
 
 
+def test_an_unusable_output_is_refused_before_any_case(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    monkeypatch.setattr(suite, "every_trial", lambda fits, full: [])
+    monkeypatch.setattr(suite, "run", lambda *_, **__: pytest.fail("run first"))
+    assert isinstance(command("--out", str(tmp_path / "file")).exception, InputError)
+
+
 def test_a_case_that_crashes_fails_by_name_and_the_others_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def crashes() -> Answer:
         raise ZeroDivisionError("somewhere deep inside")
