@@ -79,16 +79,16 @@ class PictureFiles(Frames):
     """
 
     def __init__(self, paths: Sequence[Path], settings: ContentSettings, *, folder: Path | None = None) -> None:
-        """Read the headers of all pictures, and decode the first picture.
+        """Read the headers of all pictures, and decode the first picture that can be decoded.
 
         Args:
             paths: Picture files, in order.
             settings: Content settings.
-            folder: Folder that contains the pictures, or None for a single file. Films in a folder, and files with
-                headers that cannot be read, are skipped and logged.
+            folder: Folder that contains the pictures, or None for a single file. Films in a folder, files with headers
+                that cannot be read, and pictures at the start that cannot be decoded are skipped and logged.
 
         Raises:
-            InputError: No file can be used, or the first picture cannot be decoded.
+            InputError: No file can be used.
         """
         self._background = settings.background or DARK
         self.layouts, self._paths, refused = [], [], []
@@ -104,13 +104,18 @@ class PictureFiles(Frames):
                 continue
             self.layouts.append(layout_in(header, path, settings, folder))
             self._paths.append(path)
+        self._held = -1, np.empty((0, 0, 3), np.uint8)
+        while self._paths and self._held[0] < 0:
+            try:
+                self._held = 0, self._read(0)
+            except InputError as error:  # only its header was intact
+                refused.append(error)
+                del self._paths[0], self.layouts[0]
         if not self._paths:
             raise refused[0]
         if refused:
             some = "; ".join(f"{Path(error.source).name} {error.problem}" for error in refused[:TOLD])
             log.warning("%s: skipping %d of %d pictures: %s", folder, len(refused), len(paths), some)
-        self._held = -1, np.empty((0, 0, 3), np.uint8)
-        self._held = 0, self._read(0)
         self.count, self.rate_hz = len(self._paths), settings.picture_rate_hz
         if folder is None and self.layouts == [MONO] and settings.layout == "auto":
             _suggest(paths[0], self._held[1])

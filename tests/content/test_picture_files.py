@@ -345,6 +345,17 @@ def test_a_folder_holds_pictures_of_any_size_and_kind(tmp_path: Path, context: A
     assert source.info.moving and source.info.flat_x_m is None
 
 
+def test_a_folder_that_begins_with_a_truncated_picture_shows_the_others(tmp_path: Path, caplog: Any) -> None:
+    write_png(tmp_path / "b.png", solid(RED))
+    (tmp_path / "a.png").write_bytes((tmp_path / "b.png").read_bytes()[:60])
+    frames = open_frames(tmp_path, AUTO)
+    assert frames.count == 1 and near(frames.frame(0)[0, 0], RED)
+    assert "skipping 1 of 2 pictures: a.png cannot be decoded as an image" in caplog.text
+    (tmp_path / "b.png").unlink()
+    with pytest.raises(InputError, match=r"a\.png: cannot be decoded as an image"):
+        open_frames(tmp_path, AUTO)
+
+
 def test_what_a_folder_holds_besides_is_left_out_and_named(tmp_path: Path, caplog: Any) -> None:
     (tmp_path / "a.jxl").write_bytes(b"\xff\x0a" + bytes(40))
     (tmp_path / "b.png").write_bytes(b"\x89PNG\r\n\x1a\n")
