@@ -153,7 +153,8 @@ class SolverThread(SolverHost):
         Returns "" if the solver is working on time.
         """
         attempt = self._attempt
-        busy_ns = self._clock.now_ns() - attempt.busy_since_ns if attempt.busy_since_ns else 0
+        since_ns = attempt.busy_since_ns  # read once, because the solver's thread sets it to 0 at any time
+        busy_ns = self._clock.now_ns() - since_ns if since_ns else 0
         if attempt.error is not None:
             if busy_ns > self._abandon_ns:
                 with suppress(TransientError):  # no thread is available, so the next refresh tries again

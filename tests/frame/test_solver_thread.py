@@ -232,6 +232,25 @@ def test_a_step_that_never_returns_is_abandoned_for_a_new_solver(shop: Workshop)
     assert shop.host.news().missing == {}
 
 
+def test_a_step_that_ends_while_it_is_timed_is_not_late(shop: Workshop, monkeypatch: pytest.MonkeyPatch) -> None:
+    shop.pass_s(ABANDON_S)  # so that the clock's zero is longer ago than any step may take
+    shop.behave = shop.hang
+    shop.post(1)
+    now_ns = shop.clock.now_ns
+    presenter = threading.current_thread()
+
+    def ends_the_step() -> int:
+        if threading.current_thread() is presenter:
+            shop.gates[0].set()
+            shop.settle()
+        return now_ns()
+
+    with monkeypatch.context() as patch:
+        patch.setattr(shop.clock, "now_ns", ends_the_step)
+        assert shop.host.news().missing == {}
+    assert shop.host.restarts == 0
+
+
 def test_what_an_abandoned_step_makes_is_ignored(shop: Workshop) -> None:
     shop.behave = shop.hang
     shop.post(1)
