@@ -106,8 +106,14 @@ class FramePolicy:
 
 
 def _is_more(effort: Effort | None, done: Effort | None) -> bool:
-    """Return True if `effort` uses a finer raster than `done`, or more steps on the same raster."""
+    """Return True if `effort` uses a finer raster than `done`, or more steps on the same raster.
+
+    An effort that continues a solution is no more than one on another raster, because it was chosen for a solution
+    that has been replaced since, and the new solution's pictures are too coarse to continue with.
+    """
     if effort is None or done is None:
+        return False
+    if effort.continued_from is not None and effort.reduction != done.reduction:
         return False
     return (-effort.reduction, effort.steps) > (-done.reduction, done.steps)
 

@@ -18,7 +18,7 @@ from runtime.frame.run_state import RunCell
 from runtime.frame.solver import Solver, SolverUpdate
 from runtime.model.predictor import Predictor
 from runtime.plan.drawing import drawn_job
-from runtime.records import SolveRequest
+from runtime.records import Effort, SolveRequest
 from tests.frame.conftest import SMALL
 from tests.frame.fakes import EYES, aside
 
@@ -115,6 +115,19 @@ def test_after_its_budget_no_further_step_begins_but_on_a_simulated_clock(cell: 
         made.step(wish(None, flat=True))
     assert not np.array_equal(limited.step(wish()).solution.layers, whole)
     assert np.array_equal(simulated.step(wish()).solution.layers, whole)
+
+
+def test_a_coarse_solution_is_not_continued_in_place_of_an_earlier_one(solver: Solver) -> None:
+    """The presenter asks to continue the full solution that it shows, while a coarse one for newer eyes is made."""
+    moved = aside(0.002)
+    solver.step(replace(wish(), eyes_label="rested", effort=Effort(1, 1)))
+    request = replace(wish(moved), eyes_label="rested", effort=Effort(2, 0))
+    assert solver.step(replace(request, refined_to=Effort(1, 2, continued_from=1))).solution.effort == Effort(2, 0)
+    assert solver.step(replace(request, refined_to=Effort(1, 2, continued_from=1))).solution is None
+    refined = solver.step(replace(request, refined_to=Effort(1, 0))).solution
+    continued = solver.step(replace(request, refined_to=Effort(1, 1, continued_from=0))).solution
+    assert [refined.effort, continued.effort] == [Effort(1, 0), Effort(1, 1, continued_from=0)]
+    assert refined.layers.shape == continued.layers.shape == (3, 108, 192, 4), "the display's own raster"
 
 
 OFF_M = np.array([[0.123, 0.43, 0.0], [0.078, 0.47, 0.0]])  # the right eye is 80.6 degrees off the axis
