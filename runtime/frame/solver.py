@@ -197,24 +197,24 @@ class Solver:
 
     def _draw_flat(self, state: RunState, *, revision: int, time_ns: int) -> SolverUpdate:
         watch = Stopwatch()
-        missing: dict[str, str] = {}
+        failed = False
         try:
             raster = self.stack.panel(self.stack.count // 2)
             middle = self._middle_m
             view = View(middle, 0, raster_from_stack(middle, raster), raster.width_px, raster.height_px)
             picture = state.content.render(view, time_ns=time_ns)
         except (Exception, SystemExit) as error:
-            missing = self._failed("content", error, expected=ContentFailure)
+            failed, missing = True, self._failed("content", error, expected=ContentFailure)
             if self._flat is not None:
                 return SolverUpdate(missing=missing)
             picture = np.full((self.stack.height_px, self.stack.width_px, 4), 255, np.uint8)
         layers: U8 = flat_layers(picture, self.stack)
-        if not missing:
+        if not failed:
             self._missing.pop("content", None)
             self._flat = SolutionKey(state.version, revision, None, episode=self._policy.episode)
         watch.lap("render")
         flat = Solution(self.run.next_number(), layers, None, time_ns, stage_ms=watch.stage_ms)
-        return SolverUpdate(flat=flat, missing=missing)
+        return SolverUpdate(flat=flat, missing=dict(self._missing))  # the model's fault is not over
 
     def plan_items(self, measured: Measured | None = None) -> tuple[PlanItem, ...]:
         """Return the savings applied by the plan, with the times and errors measured for them.

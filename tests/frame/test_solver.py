@@ -192,6 +192,15 @@ def test_a_model_that_fails_is_named_and_tried_again(
     assert solver.step(wish()).missing == {}
 
 
+def test_a_flat_picture_does_not_end_the_model_s_fault(
+    solver: Solver, predictor: Predictor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    broken(predictor, "solve", ModelFailure("out of memory"), monkeypatch)
+    steps = [solver.step(wish()), solver.step(wish(None, flat=True)), solver.step(wish(None, flat=True))]
+    assert steps[1].flat is not None
+    assert [step.missing for step in steps] == [{"model": "out of memory"}] * 3
+
+
 def test_where_even_the_flat_picture_fails_a_uniform_one_is_shown(
     cell: RunCell, content: ContentSource, monkeypatch: pytest.MonkeyPatch
 ) -> None:
