@@ -155,8 +155,9 @@ class Aim:
         return middle_ns, eyes.eyes_m + share * (then.eyes_m - eyes.eyes_m), then.label
 
     def _outlook(self, slots: Slots, eyes: EyesEstimate) -> Callable[[float], Outlook]:
+        far_ns = max(HORIZON_NS, self._period_ns)
         near = self._viewer.ahead(slots.photon_ns + self._period_ns)
-        far = self._viewer.ahead(slots.photon_ns + HORIZON_NS)
+        far = self._viewer.ahead(slots.photon_ns + far_ns)
         if far.label == "rested":
             return lambda cost_ms: Outlook()
         if eyes.eyes_m is None or near.eyes_m is None or far.eyes_m is None:  # a lost head, soon given up
@@ -164,7 +165,8 @@ class Aim:
             return lambda cost_ms: lost
         speed_m_s = self._usual_speed_m_s(float(np.linalg.norm((near.eyes_m - eyes.eyes_m).mean(axis=0))), eyes)
 
-        growth_m = max(far.sigma_m - near.sigma_m, 0.0) / (HORIZON_NS - self._period_ns)
+        # At 8 Hz or less, both times are the same, and so are both deviations.
+        growth_m = max(far.sigma_m - near.sigma_m, 0.0) / max(far_ns - self._period_ns, 1)
 
         def outlook(cost_ms: float) -> Outlook:
             ahead_ns = slots.middle_ns(round(cost_ms * NS_PER_MS)) - slots.photon_ns

@@ -12,6 +12,7 @@ from runtime.clock import NS_PER_MS, NS_PER_S
 from runtime.frame.aim import HORIZON_NS
 from runtime.optics.alignment import align
 from runtime.records import State
+from tests.frame import fakes
 from tests.frame.fakes import EYES, HZ, PERIOD_NS, STACK, Named, Stage, aside, picture, solution
 
 
@@ -393,6 +394,16 @@ def test_a_solver_that_has_not_started_yet_stops_no_refresh(stage: Stage) -> Non
     before = stage.presenter.stats.frames
     stage.refresh(30)
     assert stage.presenter.stats.frames == before + 30
+
+
+@pytest.mark.parametrize("rate_hz", [1, 7, 8, 9])
+def test_a_display_of_a_few_hertz_stops_no_refresh(monkeypatch: pytest.MonkeyPatch, rate_hz: int) -> None:
+    """At 8 Hz, a period is as long as eyes are predicted ahead."""
+    monkeypatch.setattr(fakes, "PERIOD_NS", NS_PER_S // rate_hz)
+    stage = Stage()
+    stage.eyes = moves
+    stage.refresh(20)
+    assert stage.solver.requests[-1].eyes_m is not None
 
 
 def test_a_calm_head_gets_longer_solutions_within_a_second() -> None:
