@@ -271,9 +271,9 @@ class Presenter:
             self._flatness.value = 1.0
         elif not self._drew_solution and target == 0.0:
             self._flatness.value = 0.0  # show the first picture without fading it in
-        flatness = self._flatness.value
-        if not self.paused:
-            flatness = self._flatness.toward(target, now_ns=self.clock.now_ns())
+        if self.paused:  # the time of the pause must not count as a part of a blend
+            target = self._flatness.value
+        flatness = self._flatness.toward(target, now_ns=self.clock.now_ns())
         if solution is None or flat is None:
             flatness = self._flatness.value = 1.0 if solution is None else 0.0
         self._drew_solution = self._drew_solution or (solution is not None and flatness < 1.0)

@@ -196,6 +196,14 @@ def test_paused_makes_nothing_new_but_stays_aligned(stage: Stage) -> None:
     assert len({matrix.tobytes() for matrix in matrices}) > HZ / 2
 
 
+def test_a_blend_takes_its_time_after_a_pause_too(stage: Stage) -> None:
+    stage.presenter.paused = True
+    stage.refresh(HZ)
+    stage.presenter.paused, stage.presenter.flat_asked = False, True
+    assert stage.refresh()[0].frame.flatness < 0.1
+    assert stage.refresh(HZ)[-1].frame.flatness == 1.0
+
+
 # --- unchanged ---------------------------------------------------------------------------------------------------
 
 
