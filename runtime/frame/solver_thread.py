@@ -220,6 +220,8 @@ class SolverThread(SolverHost):
         try:
             while not (attempt.abandoned.is_set() or self._closing.is_set()):
                 self._do_tasks(attempt, parts)
+                if attempt.abandoned.is_set():  # during a task, so the run's model is now another solver's
+                    break
                 self._adopt_model(attempt, parts)
                 request = self._next_request()
                 if request is not None:

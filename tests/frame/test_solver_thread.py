@@ -390,6 +390,21 @@ def test_a_task_may_take_longer_than_a_step(shop: Workshop, monkeypatch: pytest.
     gate.set()
 
 
+def test_parts_that_were_abandoned_in_a_task_time_nothing_afterwards(shop: Workshop) -> None:
+    """By then, the run's content and model are the new solver's, on another thread with another OpenGL context."""
+    begun, gate, timed = threading.Event(), threading.Event(), []
+    parts: Any = shop.all[0]
+    shop.host.do(lambda parts: bool(begun.set()) or gate.wait(PATIENCE_S))
+    assert begun.wait(PATIENCE_S)
+    parts.first_costs = lambda: timed.append(threading.current_thread().name) or {1: {"finish": 1e3}}
+    shop.pass_s(LIMITS.load_s)
+    shop.left()
+    gate.set()
+    assert shop.closed.get(timeout=PATIENCE_S) == "solver-1"
+    assert timed == []
+    assert shop.host.costs.ms(Effort()) == 0.0
+
+
 def test_where_no_thread_can_be_started_what_hangs_is_abandoned_later(
     shop: Workshop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
