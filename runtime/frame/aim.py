@@ -12,6 +12,7 @@ from runtime.frame.effort import HORIZON_S, Costs, EffortChooser, Outlook, candi
 from runtime.frame.run_state import RunState
 from runtime.frame.solver_host import SolverHost
 from runtime.frame.viewer import Viewer
+from runtime.plan.savings import selected_eyes
 from runtime.records import F64, Effort, EyesEstimate, EyesLabel, FrameTiming, Solution, SolveRequest
 
 HORIZON_NS = NS_PER_S // 8  # how far ahead the eyes are predicted at most, from the current refresh's display time
@@ -134,7 +135,8 @@ class Aim:
             return
         expected_m2 = self._expected.get(shown.solved_for_ns, 0.0)
         if expected_m2 > 0.0 and eyes.eyes_m is not None and eyes.label != "held":
-            found_m2 = float(((shown.solved_for_m - eyes.eyes_m).mean(axis=0) ** 2).sum())
+            eyes_m = selected_eyes(eyes.eyes_m, shown.seeing)  # otherwise, an eye left out would count as movement
+            found_m2 = float(((shown.solved_for_m - eyes_m).mean(axis=0) ** 2).sum())
             self._chooser.foresight.learn(expected_m2=expected_m2, found_m2=found_m2)
         if shown.number != self._learned and shown.measures is not None and shown.effort is not None:
             self._learned = shown.number
@@ -204,7 +206,8 @@ class Aim:
         pictures = self._chooser.pictures
         if shown is None or shown.effort is None or shown.solved_for_m is None or eyes.eyes_m is None:
             return pictures.contrast
-        moved_m = float(np.linalg.norm((shown.solved_for_m - eyes.eyes_m).mean(axis=0)))
+        eyes_m = selected_eyes(eyes.eyes_m, shown.seeing)
+        moved_m = float(np.linalg.norm((shown.solved_for_m - eyes_m).mean(axis=0)))
         return pictures.own(shown.effort) + pictures.stale(moved_m, (time_ns - shown.solved_for_ns) / NS_PER_S)
 
     def _refined(

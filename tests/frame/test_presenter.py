@@ -11,6 +11,7 @@ import pytest
 from runtime.clock import NS_PER_MS, NS_PER_S
 from runtime.frame.aim import HORIZON_NS
 from runtime.optics.alignment import align
+from runtime.plan.savings import selected_eyes
 from runtime.records import State
 from tests.frame import fakes
 from tests.frame.fakes import EYES, HZ, PERIOD_NS, STACK, Named, Stage, aside, picture, solution
@@ -425,6 +426,28 @@ def test_a_calm_head_gets_longer_solutions_within_a_second() -> None:
     asked = [request.effort.reduction for request in stage.solver.requests]
     assert asked[HZ // 3] > 2
     assert asked[-1] == 2
+
+
+def test_a_viewer_of_whom_one_eye_sees_gets_no_coarser_solutions() -> None:
+    """The solution is for the left eye alone, whose place is not that of the midpoint."""
+    beside_m = np.array([[0.123, 0.43, 0.0], [0.078, 0.47, 0.0]])
+
+    def asked(seeing: tuple[bool, bool]) -> list[int]:
+        stage, model = Stage(), Named("model of four rasters")
+        model.reductions = stage.solver.reductions = (1, 2, 3, 4)
+        stage.solver.solve_cost_ns = 150 * NS_PER_MS
+        stage.cell.replace(predictor=model)
+        stage.eyes = lambda _: beside_m
+        for number in range(HZ):
+            stage.refresh()
+            request = stage.solver.requests[-1]
+            if request.eyes_m is not None:
+                eyes_m = selected_eyes(request.eyes_m, seeing)
+                made = solution(number + 2, eyes_m, time_ns=request.time_ns, effort=request.effort, seeing=seeing)
+                stage.solver.hand_over(solved=made)
+        return [request.effort.reduction for request in stage.solver.requests[HZ // 2 :]]
+
+    assert asked((True, False)) == asked((True, True))
 
 
 def test_a_moving_head_about_to_be_given_up_gets_no_long_solution(stage: Stage) -> None:
