@@ -157,7 +157,7 @@ class RunStats:
             "stale_inputs": stale_inputs,
             "inferences": self.solutions,
             "seconds": round(seconds, 3),
-            "fps": round((self.presented - 1) / seconds, 2) if seconds > 0 else None,
+            "fps": round(max(self.presented - 1, 0) / seconds, 2) if seconds > 0 else None,
             "solutions_per_s": round(self.solutions / seconds, 2) if seconds > 0 else None,
             "stage_ms": {stage: ring.of("p50", "p95", "p99", "max") for stage, ring in self._stages.items()},
             "interval_ms": self._interval.of("p50", "p99"),

@@ -82,6 +82,11 @@ def test_a_refresh_without_its_picture_is_dropped_and_splits_the_interval() -> N
     assert summary["interval_ms"]["p99"] == 20.0  # no interval of 40 ms is invented
 
 
+def test_panels_that_never_showed_anything_have_a_rate_of_zero() -> None:
+    summary = told([account(k, presented=False) for k in range(51)]).summary(stale_inputs=0)
+    assert (summary["presented"], summary["dropped"], summary["fps"]) == (0, 51, 0.0)
+
+
 def test_overhead_leaves_out_the_first_refresh() -> None:
     stats = RunStats()
     stats.add(account(0), overhead_ms=500.0)
