@@ -99,8 +99,11 @@ class Solver:
             return self._draw_flat(state, revision=revision, time_ns=time_ns)
         if job.eyes_m is not None:
             wanted = request.refined_to if job.kind == "refine" else request.effort
-            if wanted is None or wanted.reduction not in state.predictor.reductions:  # not offered by a new model
-                wanted = Effort(1, state.predictor.steps)
+            offered, steps = state.predictor.reductions, state.predictor.steps  # may be those of a new model
+            if wanted is None or wanted.reduction not in offered:
+                wanted = Effort(1, steps)
+            elif job.kind == "solve":
+                wanted = replace(wanted, steps=min(wanted.steps, steps))
             return self._solve(state, request, job.eyes_m, wanted, revision=revision)
         if request.eyes_m is not None and not request.paused:
             self._missing = {}  # the latest solution already fulfils the request
