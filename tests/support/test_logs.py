@@ -17,19 +17,10 @@ import pytest
 
 from runtime.clock import NS_PER_S, SimulatedClock
 from runtime.support import logs
-from runtime.support.logs import BURST, QUEUED_MAX, ROOTS, configure
+from runtime.support.logs import BURST, QUEUED_MAX, configure
 
 ROOT = Path(__file__).parents[2]
 log = logging.getLogger("phasestack.test")
-
-
-@pytest.fixture(autouse=True)
-def restored() -> Any:
-    loggers = [logging.getLogger(name) for name in ROOTS]
-    before = [(logger.handlers[:], logger.level, logger.propagate) for logger in loggers]
-    yield
-    for logger, (handlers, level, propagate) in zip(loggers, before, strict=True):
-        logger.handlers[:], logger.level, logger.propagate = handlers, level, propagate
 
 
 class File:
