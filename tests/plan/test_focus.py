@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -25,21 +24,9 @@ from runtime.optics.views import image_from_stack
 from runtime.plan.drawing import drawn_job, raster_views, retina_pictures
 from runtime.plan.savings import make_plan, selected_eyes
 from runtime.records import F64, U8
-from runtime.support.gl import offscreen_context
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 960, 540)
 EYES = np.array([[0.6, -0.031, 0.05], [0.6, 0.031, 0.05]])
-
-
-@pytest.fixture(scope="module")
-def gl() -> Any:
-    return offscreen_context()
-
-
-@pytest.fixture
-def context(gl: Any) -> Iterator[Any]:
-    with gl:
-        yield gl
 
 
 @pytest.fixture(scope="module")
