@@ -208,11 +208,10 @@ def test_a_recording_of_any_rate_plays_once_and_repeatably(tmp_path: Path, rate_
 def test_a_gap_of_three_seconds_passes_holding_and_flat_once(tmp_path: Path) -> None:
     times = [*evenly(30, 0.7), *evenly(30, 0.7, start_s=4.7)]
     recording = recorded(tmp_path / "gap.mcap", times, motion="still")
-    first = played(tmp_path / "a", recording)
-    assert files_of(first) == files_of(played(tmp_path / "b", recording))
-    lines = lines_of(first)
+    folder = played(tmp_path / "a", recording)
+    lines = lines_of(folder)
     assert states_passed(lines) == ["flat", "tracking", "holding", "flat", "tracking"]
-    assert summary_of(first)["seconds"] == pytest.approx(3.7 + 0.7, abs=0.08)
+    assert summary_of(folder)["seconds"] == pytest.approx(3.7 + 0.7, abs=0.08)
     assert max(np.diff([line["present_ns"] for line in lines])) < 1.1 * NS_PER_S / 60
     gap = [line for line in lines if line["present_ns"] / NS_PER_S - lines[0]["present_ns"] / NS_PER_S > 2]
     assert gap[0]["eyes_m"] is None
