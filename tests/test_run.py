@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -250,6 +251,7 @@ def test_real_and_simulated_time_pass_the_same_states(tmp_path: Path) -> None:
 def test_the_demo_ends_in_time_and_names_its_simulated_clock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("runtime.commands.demo.LONGEST_S", 0.0)
     monkeypatch.setattr("runtime.commands.demo.LEAST", 4)
+    monkeypatch.setattr("runtime.daemon.drive.drive", lambda s, o, host: drive(s, replace(o, scale=0.1), host))
     with pytest.raises(SystemExit):
         app(["demo", "--out", str(tmp_path)])
     summary = json.loads((tmp_path / "summary.json").read_text())
