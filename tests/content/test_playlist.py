@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 from runtime.clock import NS_PER_S
-from runtime.config import ContentSettings
 from runtime.content.base import ContentSource
-from runtime.content.registry import open_content
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.support.artifacts import write_png
 from tests.content.conftest import panel_view
+from tests.content.test_pictures import opened
 
 EYE = (0.6, 0.0, 0.0)
 COLOURS = {"red.png": (255, 0, 0), "green.png": (0, 255, 0), "blue.png": (0, 0, 255)}
@@ -32,10 +31,6 @@ def written(folder: Path, *shows: str, head: str = "") -> Path:
     path = folder / "list.toml"
     path.write_text(head + "".join(f"[[show]]\n{show}\n" for show in shows))
     return path
-
-
-def opened(path: Path, context: Any, stack: PanelStack, **settings: Any) -> ContentSource:
-    return open_content(ContentSettings(scene=str(path), **settings), stack, context)
 
 
 def colour_at(source: ContentSource, stack: PanelStack, time_s: float) -> str:

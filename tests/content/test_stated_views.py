@@ -15,13 +15,10 @@ from runtime.content.film_header import film_header
 from runtime.content.frames import open_frames, read_pair
 from runtime.support.picture_file import read_image, read_views
 from tests.content.picture_files import equirectangular, film, lif, multiview, of_colours, st3d
+from tests.content.test_pictures import solid
 
 RED, BLUE = (200, 40, 40), (40, 40, 200)
 AUTO = ContentSettings()
-
-
-def solid(colour: tuple[int, int, int], width: int = 160, height: int = 90) -> np.ndarray:
-    return np.full((height, width, 3), colour, np.uint8)
 
 
 def middle(picture: np.ndarray) -> str:
