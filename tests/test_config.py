@@ -60,6 +60,12 @@ PANEL = '[[output.panels]]\nconnector = "DP-{}"\n'
         ("[stack]\nx_m = [-0.06, false, 0.06]", "stack.x_m.1", "valid number"),
         ("[stack]\ntilt = [[0, 0], [0, true], [0, 0]]", "stack.tilt.1.1", "valid number"),
         ("[loop]\nsimulated_stage_ms = { render = true }", "loop.simulated_stage_ms.render", "valid number"),
+        ('[model]\neye_sigma_mm = "foo"', "model.eye_sigma_mm", "'auto' or a valid number"),
+        (
+            '[content]\nlayout = "foo"',
+            "content.layout",
+            "'foo' is not valid; expected: arrangement of the views: mono,",
+        ),
     ],
 )
 def test_nonsense_is_refused_with_its_field_and_a_suggestion(tmp_path: Path, text: str, field: str, said: str) -> None:

@@ -36,7 +36,12 @@ def record(
     ] = False,
     seconds: Annotated[
         float | None,
-        number(0.1, RECORD_MOST_S, "s", help="length of the recording in seconds (default: 600, or 12 with --motion)"),
+        number(
+            0.1,
+            RECORD_MOST_S,
+            "s",
+            help="length of the recording in seconds (default: 600, or 12 with --motion, where 3600 is the maximum)",
+        ),
     ] = None,
     motion: Annotated[
         str | None,

@@ -20,6 +20,8 @@ STRINGS_AND_COMMENTS = re.compile(
 )
 KEY_SEPARATORS = re.compile(r"[\n=,{}\[\]]")
 M = TypeVar("M", bound=BaseModel)
+EXPECTED = "Input should be "  # beginning of many of pydantic's messages
+UNION_MEMBER = re.compile(r"literal\[.*\]|constrained-\w+")  # a type's name in the path to a field of several types
 
 
 class Section(BaseModel):
@@ -101,15 +103,22 @@ def validated(model: type[M], table: dict[str, Any], *, source: str | Path, fold
     try:
         return model.model_validate(table, context=folder)
     except ValidationError as error:
-        (name, problem), *others = dict(_wrong_field(model, each) for each in error.errors()).items()
+        problems: dict[str, str] = {}
+        for field, problem in (_wrong_field(model, each) for each in error.errors()):
+            before = problems.get(field)  # a field of several types has an error for each of them
+            problems[field] = problem if before is None else f"{before} or {problem.removeprefix(EXPECTED)}"
+        (name, problem), *others = problems.items()
         rest = [f"{field}: {one_line(text)}" if field else one_line(text) for field, text in others]
         raise InputError(source, name, "; ".join([one_line(problem), *rest])) from None
 
 
 def _wrong_field(model: type[BaseModel], error: Any) -> tuple[str, str]:
     """Return the full name of the field that a pydantic error concerns, and the problem."""
-    name = ".".join(str(part) for part in error["loc"])
+    name = ".".join(str(part) for part in error["loc"] if not UNION_MEMBER.fullmatch(str(part)))
     message = error["msg"].removeprefix("Value error, ")
+    if error["type"] == "string_pattern_mismatch":
+        described = _record(model, error["loc"][:-1]).model_fields[error["loc"][-1]].description
+        return name, f"{error['input']!r} is not valid; expected: {described}"
     if error["type"] == "extra_forbidden":
         return name, "is not a setting" + nearest(str(error["loc"][-1]), _keys(model, error["loc"][:-1]))
     field, colon, rest = message.partition(": ")
@@ -120,10 +129,15 @@ def _wrong_field(model: type[BaseModel], error: Any) -> tuple[str, str]:
 
 def _keys(model: type[BaseModel], path: tuple[int | str, ...]) -> list[str]:
     """Return the keys allowed in the table at a path of keys within a record."""
+    return list(getattr(_record(model, path), "model_fields", ()))
+
+
+def _record(model: type[BaseModel], path: tuple[int | str, ...]) -> Any:
+    """Return the type that the table at a path of keys within a record is validated against."""
     table: Any = model
     for part in path:
         if isinstance(part, str) and part in getattr(table, "model_fields", ()):
             annotation = table.model_fields[part].annotation
             candidates = (annotation, *getattr(annotation, "__args__", ()))
             table = next((kind for kind in candidates if hasattr(kind, "model_fields")), annotation)
-    return list(getattr(table, "model_fields", ()))
+    return table
