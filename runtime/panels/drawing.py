@@ -17,7 +17,7 @@ from runtime.panels.display import Display, Window, gl_function, glfw, x_display
 from runtime.panels.monitors import Monitor
 from runtime.panels.presentation import FrameTextures, Painter
 from runtime.panels.processor import Mounting, ProcessorPainter
-from runtime.panels.shared_picture import NotShared, SharedPicture, finish, flush, last_request
+from runtime.panels.shared_picture import NotShared, SharedPicture, finish, flush
 from runtime.records import PanelFrame
 from runtime.support.gl import draws_in_software
 
@@ -177,7 +177,6 @@ class ProcessorWindows(PanelWindows):
         super().__init__()
         self._pictures: list[SharedPicture] = []
         self._changed: dict[int, PixelRect] = {}  # changed parts of the pictures
-        self._last_copy = 0  # number of the last request to copy a picture
         try:
             for number, monitor in enumerate(monitors):
                 window = display.fullscreen_window(monitor, title=f"panel {number}", opengl=False)
@@ -204,7 +203,7 @@ class ProcessorWindows(PanelWindows):
         return any(window.exposed for window in self.windows)
 
     def draw(self, frame: PanelFrame) -> None:
-        finish(x_display(), self._last_copy)  # the X server may still be copying the last frame
+        finish(x_display())  # the X server may still be copying the last frame
         self._changed = self._painter.draw(frame)
 
     def show(self, clock: Clock) -> tuple[int, int]:
@@ -214,7 +213,6 @@ class ProcessorWindows(PanelWindows):
                 part = None if window.exposed else self._changed[panel]
                 window.exposed = False
                 picture.put(part)
-                self._last_copy = last_request(x_display())
                 shown += 1
         flush(x_display())
         # The X server copies the pictures meanwhile. Waiting for it would leave too little time to draw the next frame.
@@ -229,11 +227,11 @@ class ProcessorWindows(PanelWindows):
         """Return how long the X server takes to copy a picture, from copying the black pictures several times."""
         copies_ns = []
         for _ in range(COPIES):  # the first is slow, because the server has not used the memory yet
-            finish(x_display(), last_request(x_display()))
+            finish(x_display())
             began_ns = clock.now_ns()
             for picture in self._pictures:
                 picture.put()
-            finish(x_display(), last_request(x_display()))
+            finish(x_display())
             copies_ns.append(clock.now_ns() - began_ns)
         return min(copies_ns) // len(self._pictures)
 

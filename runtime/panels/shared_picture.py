@@ -17,7 +17,6 @@ from runtime.optics.rect import PixelRect
 from runtime.panels import xlib
 from runtime.records import U8
 
-AFTER_READING = 1  # mode of XEventsQueued: read all events that have arrived
 PRIVATE, CREATE, OWNER_ONLY, REMOVE = 0, 0o1000, 0o600, 0  # arguments of shmget and shmctl
 Z_PIXMAP, ALL_PLANES = 2, 0xFFFFFFFF
 # The picture's first byte in its segment. On an AMD Zen 3 processor, the X server's copy takes 1.5 times as long if
@@ -83,16 +82,13 @@ def _libraries() -> tuple[ctypes.CDLL, ctypes.CDLL, ctypes.CDLL]:
 
 @functools.cache
 def _short_calls() -> tuple[ctypes.PyDLL, ctypes.PyDLL]:
-    """Return the libraries of functions that never wait for the X server.
+    """Return the libraries of functions that only write to the connection.
 
     They keep Python's global lock. Taking it again could take milliseconds, because the solver's thread, which has a
     lower priority, may lose its processor while it has the lock.
     """
     x11, extensions = ctypes.PyDLL("libX11.so.6"), ctypes.PyDLL("libXext.so.6")
     x11.XFlush.argtypes = [c_void_p]
-    x11.XNextRequest.restype, x11.XNextRequest.argtypes = c_ulong, [c_void_p]
-    x11.XEventsQueued.argtypes = [c_void_p, c_int]
-    x11.XLastKnownRequestProcessed.restype, x11.XLastKnownRequestProcessed.argtypes = c_ulong, [c_void_p]
     extensions.XShmPutImage.argtypes = [
         c_void_p, c_ulong, c_void_p, POINTER(_Image), c_int, c_int, c_int, c_int, c_uint, c_uint, c_int,
     ]  # fmt: skip
@@ -126,14 +122,11 @@ class SharedPicture:
             raise
 
     def put(self, part: PixelRect | None = None) -> None:
-        """Ask the X server to copy the picture, or part of it, to its window.
-
-        The server sends an event once it has done so. `finish` waits for it.
-        """
+        """Ask the X server to copy the picture, or part of it, to its window. `finish` waits for it."""
         image = self._image.contents
         part = part or PixelRect(0, 0, image.width, image.height)
         at, size = (part.u0, part.v0), (part.width_px, part.height_px)
-        _short_calls()[1].XShmPutImage(self._display, self._window, self._context, self._image, *at, *at, *size, 1)
+        _short_calls()[1].XShmPutImage(self._display, self._window, self._context, self._image, *at, *at, *size, 0)
 
     def close(self) -> None:
         """Release the memory. May be called more than once. `pixels` must not be used afterwards."""
@@ -207,28 +200,13 @@ class SharedPicture:
         return int(pixel)
 
 
-def last_request(display: int) -> int:
-    """Return the number of the last request to the X server.
+def finish(display: int) -> None:
+    """Wait until the X server has carried out every request.
 
     Args:
         display: Pointer to an open Xlib `Display`.
     """
-    return int(_short_calls()[0].XNextRequest(display)) - 1
-
-
-def finish(display: int, request: int) -> None:
-    """Wait until the X server has carried out a request that `SharedPicture.put` sent.
-
-    If its event has arrived, Python's global lock is kept, because getting it back could take milliseconds.
-
-    Args:
-        display: Pointer to an open Xlib `Display`.
-        request: The request's number (`last_request`).
-    """
-    x11 = _short_calls()[0]
-    x11.XEventsQueued(display, AFTER_READING)
-    if x11.XLastKnownRequestProcessed(display) < request:
-        _libraries()[0].XSync(display, 0)
+    _libraries()[0].XSync(display, 0)
 
 
 def flush(display: int) -> None:

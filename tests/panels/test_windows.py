@@ -20,8 +20,7 @@ from runtime.errors import PanelLost
 from runtime.optics.alignment import align, shown_layers
 from runtime.optics.stack import PanelStack
 from runtime.panels import drawing
-from runtime.panels.display import glfw, x_display
-from runtime.panels.shared_picture import finish, last_request
+from runtime.panels.display import glfw
 from runtime.panels.window import WindowPanels
 from runtime.records import PanelFrame
 from tests.panels.edids import block
@@ -186,16 +185,6 @@ def test_a_picture_that_another_window_covered_is_shown_again(x: XServer, opened
         return bool(np.array_equal(x.panel(2), picture(0, 0)[..., :3]))
 
     assert eventually(shown_again)
-
-
-@PROCESSOR
-def test_the_x_server_announces_when_it_has_copied_the_pictures(opened: Callable[..., Any]) -> None:
-    sink = opened(*BY_CONNECTOR)
-    sink.present(frame(0))
-    display, copy = x_display(), last_request(x_display())
-    time.sleep(0.5)  # long enough to copy three small pictures
-    finish(display, copy)
-    assert last_request(display) == copy  # it did not have to ask
 
 
 @PROCESSOR
