@@ -323,7 +323,6 @@ class Presenter:
         try:
             report = self.panels.present(frame, unchanged=unchanged, due_ns=due_ns)
         except PanelLost as error:
-            self.stats.fault("panel")
             return None, str(error)
         self._presented = True
         return report, ""
@@ -342,8 +341,8 @@ class Presenter:
             missing["panel"] = lost
         if fault := self.samples.fault() or self.viewer.warning.removeprefix("sensor: "):
             missing["sensor"] = fault
-        for part in news.missing:
-            if part not in self.missing or news.missing[part] != self.missing[part]:
+        for part in missing:
+            if part not in self.missing:
                 self.stats.fault(part)
         return missing
 

@@ -136,7 +136,7 @@ class RunStats:
         }
 
     def fault(self, part: str) -> None:
-        """Count a fault that did not end the run."""
+        """Count a part's fault when it begins. Its reason may change before the part works again."""
         self.faults[part] = self.faults.get(part, 0) + 1
 
     def summary(self, *, stale_inputs: int, simulated: bool = False) -> dict[str, Any]:
