@@ -140,19 +140,20 @@ def test_the_largest_stl_takes_half_a_gigabyte_and_not_here(tmp_path: Path) -> N
     assert here < 60 and seconds < 1.0
 
 
-def deep(folder: Path) -> Path:
-    cv2.imwrite(str(folder / "deep.png"), np.full((4096, 8192, 4), 0x8080, np.uint16))
+def deep(folder: Path, width: int, height: int) -> Path:
+    cv2.imwrite(str(folder / "deep.png"), np.full((height, width, 4), 0x8080, np.uint16))
     return folder / "deep.png"
 
 
 @pytest.mark.parametrize(
     ("make", "told", "most"),
     [
-        (deep, "", 900),  # 21 bytes a pixel; 82 before
+        (lambda folder: deep(folder, 8192, 4096), "", 900),  # 21 bytes a pixel; 82 before
+        (lambda folder: deep(folder, 16_384, 8192), "of 16 bits per channel; the maximum is 67,108,864", 200),  # 11 GB
         (lambda folder: painted(folder, png(16_384, 8192, "RGB")), "", 1300),  # 2.0 GB
         (lambda folder: painted(folder, *[png(4096, 4096)] * 40), "exceeds the limit of 134,217,728", 400),  # 2.8 GB
     ],
-    ids=["deep", "a large texture", "many textures"],
+    ids=["deep", "too deep", "a large texture", "many textures"],
 )
 def test_a_small_file_that_unpacks_to_much_stays_within_its_limits(
     make: Any, told: str, most: int, tmp_path: Path
