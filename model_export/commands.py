@@ -33,7 +33,7 @@ Options = Annotated[
 
 
 def train(
-    out: Annotated[Path, typer.Option(help="folder for checkpoint.pth, curve.csv and curve.png")],
+    out: Annotated[Path, typer.Option(file_okay=False, help="folder for checkpoint.pth, curve.csv and curve.png")],
     arch: Arch,
     option: Options = None,
     data: Annotated[

@@ -9,7 +9,9 @@ import typer
 
 
 def report(
-    out: Annotated[Path, typer.Option(help="folder for index.html, report.json and the plots")] = Path("report"),
+    out: Annotated[Path, typer.Option(file_okay=False, help="folder for index.html, report.json and the plots")] = Path(
+        "report"
+    ),
     pairs: Annotated[Path | None, typer.Option(help="folder containing case files for your own stereo pairs")] = None,
     focal: Annotated[bool, typer.Option("--focal", help="also measure focal parallax through the layers")] = False,
     model: Annotated[list[str] | None, typer.Option(help="additional ONNX file to compare (can be repeated)")] = None,
