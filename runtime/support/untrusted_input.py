@@ -185,7 +185,7 @@ def read_json(path: str | Path, *, most_bytes: int = JSON_BYTES_MAX) -> Any:
 
 
 def parsed_json(text: str | bytes, *, source: str | Path, most_depth: int = JSON_DEPTH_MAX) -> Any:
-    """Parse strict JSON, which excludes NaN and Infinity.
+    """Parse strict JSON, which excludes NaN, Infinity and repeated keys.
 
     Args:
         text: JSON text, as a string or as UTF-8 bytes.
@@ -198,7 +198,9 @@ def parsed_json(text: str | bytes, *, source: str | Path, most_depth: int = JSON
     data = text if isinstance(text, bytes) else text.encode(errors="surrogatepass")
     within(sum(map(data.count, (b",", b"{", b"["))), LIMITS.json_values, source=source, field="JSON values")
     try:
-        value = json.loads(decoded(data, source=source), parse_constant=_no_constant, parse_int=_whole)
+        value = json.loads(
+            decoded(data, source=source), parse_constant=_no_constant, parse_int=_whole, object_pairs_hook=_object
+        )
         if _depth(value) <= most_depth:
             return value
     except ValueError as error:
@@ -215,6 +217,15 @@ def _depth(value: Any) -> int:
     if isinstance(value, list):
         return 1 + max(map(_depth, value), default=0)
     return 0
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    value: dict[str, Any] = {}
+    for key, item in pairs:
+        if key in value:
+            raise ValueError(f'the key "{shown(key)}" is repeated')
+        value[key] = item
+    return value
 
 
 def _no_constant(name: str) -> float:

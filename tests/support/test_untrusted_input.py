@@ -110,7 +110,8 @@ def test_json_may_nest_so_deep_and_no_deeper(opening: str, closing: str) -> None
 
 
 @pytest.mark.parametrize(
-    "text", ["NaN", "[Infinity]", '{"a": -Infinity}', "", "{", "9" * 5000 + "x", b"\xff", "\ud800"]
+    "text",
+    ["NaN", "[Infinity]", '{"a": -Infinity}', '{"a": 1, "b": 2, "a": 1}', "", "{", "9" * 5000 + "x", b"\xff", "\ud800"],
 )
 def test_what_is_no_json_is_refused(text: str | bytes) -> None:
     refused(parsed_json, text, source="a")
