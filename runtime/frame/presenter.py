@@ -271,7 +271,7 @@ class Presenter:
             self._flatness.value = 1.0
         elif not self._drew_solution and target == 0.0:
             self._flatness.value = 0.0  # show the first picture without fading it in
-        if self.paused:  # the time of the pause must not count as a part of a blend
+        if self.paused and not self.flat_asked:  # the time of the pause must not count as a part of a blend
             target = self._flatness.value
         flatness = self._flatness.toward(target, now_ns=self.clock.now_ns())
         if solution is None or flat is None:
