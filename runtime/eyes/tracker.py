@@ -233,11 +233,15 @@ class Tracker:
         age_s = last.head.age_s(sample.capture_ns)
         is_held = self._lost_ns is not None or age_s > HORIZON_S
         head = sample.continued(last.head)
+        known = self._other
+        again = sample.continued(known.head) if known is not None else None
+        if again is not None and last.head.samples < ESTABLISHED and (head is None or again.surprise < head.surprise):
+            self._history.clear()  # the viewer's few samples were the mistake
+            self._follow(again)
+            return ""
         if head is not None and head.surprise <= CHI2_DOUBT:
             self._follow(head, is_return=is_held)
             return ""
-        known = self._other
-        again = sample.continued(known.head) if known is not None else None
         if head is not None:
             is_others = again is not None and again.surprise < head.surprise and not (known and known.may_be_viewer)
             if not is_others:
@@ -258,7 +262,7 @@ class Tracker:
         ):
             self._history.pop()  # the two newest samples fit better without this entry
             self._follow(head, is_return=True)
-        elif age_s > min(ANOTHER_AFTER_S, self.settings.hold_s) or (is_second and last.head.samples < ESTABLISHED):
+        elif age_s > min(ANOTHER_AFTER_S, self.settings.hold_s):
             self._history.clear()
             self._follow(other.head)
         else:

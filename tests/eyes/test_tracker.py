@@ -147,6 +147,23 @@ def test_a_hasty_head_is_followed_at_its_second_sample() -> None:
     np.testing.assert_allclose(tracker.at(last + 16 * PERIOD + 20 * MS).eyes_m, far, atol=1e-9)  # and immediately
 
 
+@given(
+    offset_m=st.tuples(*[st.floats(-0.1, 0.1)] * 3).filter(lambda off: np.linalg.norm(off) > 0.04),
+    seed=st.integers(0, 1000),
+)
+def test_a_mistaken_first_sample_is_dropped_without_leaving_any_speed(
+    offset_m: tuple[float, float, float], seed: int
+) -> None:
+    """Else the wrong place is taken for the start of a fast movement, and eyes are predicted to fly on."""
+    noise_m = np.random.default_rng(seed).normal(0.0, 3e-4, (4, 2, 3))
+    tracker = Tracker()
+    tracker.update(points(STILL + np.array(offset_m)), capture_ns=10**9)
+    for k in (1, 2, 3):
+        tracker.update(points(STILL + noise_m[k]), capture_ns=10**9 + k * PERIOD)
+    at = [tracker.ahead(10**9 + 3 * PERIOD + ms * MS).eyes_m for ms in (0, 125)]
+    np.testing.assert_allclose(at, [STILL, STILL], atol=0.005)
+
+
 # --- uncertainty
 
 
