@@ -50,6 +50,7 @@ BLUR_M = 4e-3  # d0; farther away, outlines are displaced by more than their blu
 FIRST_CONTRAST = 0.03  # initial estimate of D_max
 FORESIGHT_GAIN = 1 / 60  # weight given to the latest refresh in the running means kept by `Foresight`
 LEAST_SCALE, MOST_SCALE = 0.02, 4.0
+MOST_FOUND = 16.0  # limit on the ratio at a single refresh, because samples may be mistaken
 TAIL = 0.02  # slope with respect to y left at saturation, so that a smaller distance is always better
 SCALE_M, SCALE_S = 5e-3, 0.1  # units of displacement and time used in fitting the rates
 
@@ -191,7 +192,7 @@ class Foresight:
     def learn(self, *, expected_m2: float, found_m2: float) -> None:
         """Update the ratio with the distances found at one refresh."""
         self._expected += FORESIGHT_GAIN * (expected_m2 - self._expected)
-        self._found += FORESIGHT_GAIN * (found_m2 - self._found)
+        self._found += FORESIGHT_GAIN * (min(found_m2, MOST_FOUND * expected_m2) - self._found)
         if self._expected > 0.0:
             self.scale = min(max(self._found / self._expected, LEAST_SCALE), MOST_SCALE)
 

@@ -134,6 +134,14 @@ def test_displacements_are_scaled_to_those_that_come_to_pass() -> None:
     assert foresight.scale == pytest.approx(0.25, rel=0.01)
 
 
+def test_a_single_jump_hardly_changes_what_the_predictions_are_worth() -> None:
+    foresight = Foresight()
+    for _ in range(300):
+        foresight.learn(expected_m2=4e-6, found_m2=4e-6)
+    foresight.learn(expected_m2=4e-6, found_m2=0.1**2)  # one sample was mistaken by 10 cm
+    assert foresight.scale < 1.5
+
+
 def test_measured_costs_replace_first_ones_and_scale_those_of_other_rasters() -> None:
     first = {by: {stage: ms / by**2 for stage, ms in STAGE_MS.items()} for by in REDUCTIONS}
     book = CostBook(first)
