@@ -161,11 +161,14 @@ class Aim:
         near = self._viewer.ahead(slots.photon_ns + self._period_ns)
         far = self._viewer.ahead(slots.photon_ns + far_ns)
         if far.label == "rested":
+            self._speed2 = 0.0
             return lambda cost_ms: Outlook()
         if eyes.eyes_m is None or near.eyes_m is None or far.eyes_m is None:  # a lost head, soon given up
             lost = Outlook(eyes.sigma_m, self._speed2**0.5)
             return lambda cost_ms: lost
-        speed_m_s = self._usual_speed_m_s(float(np.linalg.norm((near.eyes_m - eyes.eyes_m).mean(axis=0))), eyes)
+        moved_m2 = float(((near.eyes_m - eyes.eyes_m).mean(axis=0) ** 2).sum())
+        unsure_m = max(near.sigma_m - eyes.sigma_m, 0.0)  # explains this much movement along each axis
+        speed_m_s = self._usual_speed_m_s(max(moved_m2 - 2 * unsure_m**2, 0.0) ** 0.5, eyes)
 
         # At 8 Hz or less, both times are the same, and so are both deviations.
         growth_m = max(far.sigma_m - near.sigma_m, 0.0) / max(far_ns - self._period_ns, 1)

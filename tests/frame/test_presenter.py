@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
 
@@ -201,6 +202,14 @@ def test_a_blend_takes_its_time_after_a_pause_too(stage: Stage) -> None:
     stage.presenter.paused = True
     stage.refresh(HZ)
     stage.presenter.paused, stage.presenter.flat_asked = False, True
+    assert stage.refresh()[0].frame.flatness < 0.1
+    assert stage.refresh(HZ)[-1].frame.flatness == 1.0
+
+
+def test_a_paused_picture_can_be_made_flat(stage: Stage) -> None:
+    stage.presenter.paused = True
+    stage.refresh(HZ)
+    stage.presenter.flat_asked = True
     assert stage.refresh()[0].frame.flatness < 0.1
     assert stage.refresh(HZ)[-1].frame.flatness == 1.0
 
@@ -429,6 +438,25 @@ def test_a_calm_head_gets_longer_solutions_within_a_second() -> None:
     asked = [request.effort.reduction for request in stage.solver.requests]
     assert asked[HZ // 3] > 2
     assert asked[-1] == 2
+
+
+def test_a_head_that_has_rested_gets_the_solutions_of_one_that_never_moved() -> None:
+    """The speed before the rest says nothing about a head that stirs after it."""
+
+    def asked(before: Callable[[float], Any]) -> list[int]:
+        stage, model = Stage(plan={"enabled": True}), Named("model of four rasters")
+        model.reductions = stage.solver.reductions = (1, 2, 3, 4)
+        stage.solver.solve_cost_ns = 150 * NS_PER_MS
+        stage.cell.replace(predictor=model)
+        stage.eyes = lambda time_s: before(time_s) if time_s < 2.0 else aside(0.01 * max(time_s - 6.0, 0.0))
+        stage.refresh(6 * HZ)
+        assert stage.solver.requests[-1].eyes_label == "rested"
+        stage.refresh(HZ)
+        requests = stage.solver.requests[-HZ:]
+        assert requests[-1].eyes_label == "predicted"
+        return [request.effort.reduction for request in requests]
+
+    assert asked(lambda time_s: aside(0.5 * np.sin(4 * time_s))) == asked(lambda time_s: EYES)
 
 
 def test_a_viewer_of_whom_one_eye_sees_gets_no_coarser_solutions() -> None:
