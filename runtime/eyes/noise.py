@@ -17,7 +17,7 @@ from runtime.records import F64
 WINDOW = 5  # samples to a difference
 LONGEST_NS = NS_PER_S * 2 // 5  # longest window, because a head may turn within a longer one
 KEPT = 64  # number of newest differences kept: two seconds at 30 Hz
-FEWEST = 8  # number of differences needed for a measurement
+FEWEST = 16  # number of differences needed for a measurement
 EVERY = 4  # noise changes slowly, so it is measured once in this many samples
 MAD_TO_SIGMA = 1.4826  # a normal distribution's standard deviation, divided by its median absolute deviation
 LEAST_M = 1e-4  # smallest standard deviation returned, because a head does not move exactly as the filter assumes
