@@ -122,6 +122,44 @@ class _Pictures:
     rises: tuple[float, ...] = ()  # each relief's largest absolute value
 
 
+class _PictureMemory:
+    """Memory for a picture for each panel, whatever the pictures' size.
+
+    It is written to at once, because the first use of memory takes so long that a refresh would be late.
+    """
+
+    def __init__(self, mountings: Sequence[Mounting]) -> None:
+        self._rest = min(rest_code(len(mountings)), 255)
+        self._memory = [np.full(0, self._rest, np.uint8)] * len(mountings)
+        self._pictures: tuple[U8, ...] = ()
+        self._made_for: object = None
+        self.pictures([mounting.turned_px for mounting in mountings], border_px=1)
+
+    def pictures(self, sizes_px: list[tuple[int, int]], *, border_px: int) -> tuple[U8, ...]:
+        """Return a picture for each panel, with a border of the rest code around a picture to be filled in.
+
+        Args:
+            sizes_px: Width and height of each panel's picture, without the border.
+            border_px: Width of the border.
+        """
+        if self._made_for != (sizes_px, border_px):
+            self._made_for = sizes_px, border_px
+            self._pictures = tuple(
+                self._picture(panel, width + 2 * border_px, height + 2 * border_px, border_px)
+                for panel, (width, height) in enumerate(sizes_px)
+            )
+        return self._pictures
+
+    def _picture(self, panel: int, width: int, height: int, border_px: int) -> U8:
+        count = 4 * width * height
+        if count > self._memory[panel].size:
+            self._memory[panel] = np.full(count, self._rest, np.uint8)
+        picture = self._memory[panel][:count].reshape(height, width, 4)
+        for lines in (picture, picture.swapaxes(0, 1)):
+            lines[:border_px] = lines[len(lines) - border_px :] = self._rest
+        return picture
+
+
 class ProcessorPainter:
     """Draws frames into pictures in memory, one for each panel."""
 
@@ -140,7 +178,7 @@ class ProcessorPainter:
         self._curves = [_curve_table(panel) if panel.lut or panel.gamma != 1 else None for panel in panels]
         self._solved: _Pictures | None = None
         self._flat: _Pictures | None = None
-        self._memory: dict[object, tuple[U8, ...]] = {}  # pictures, reused for layers of the same size
+        self._solved_memory, self._flat_memory = _PictureMemory(mountings), _PictureMemory(mountings)
         self._drawn: list[object] = [None] * len(screens)  # key of each picture's content
         self._filled = [_whole(screen) for screen in screens]  # outside, a picture shows the rest code
         self._threads = min(len(os.sched_getaffinity(0)), MOST_THREADS)
@@ -184,7 +222,8 @@ class ProcessorPainter:
         if self._solved is None or self._solved.version != frame.solved_version:
             height, width = frame.solved.shape[1:3]
             coarse = frame.size_px not in (None, (width, height))
-            pictures, boxes = self._prepared(frame.solved, border_px=2 if coarse else 1, extended=coarse)
+            memory, border_px = self._solved_memory, 2 if coarse else 1
+            pictures, boxes = self._prepared(frame.solved, memory, border_px=border_px, extended=coarse)
             reliefs: tuple[F32, ...] = ()
             rises: tuple[float, ...] = ()
             if frame.relief is not None:
@@ -193,7 +232,7 @@ class ProcessorPainter:
                     for mounting, screen in zip(self._mountings, self._screens, strict=True)
                 )
                 rises = tuple(float(np.abs(relief).max()) for relief in reliefs)
-            self._solved = _Pictures(frame.solved_version, (width, height), 1 + coarse, pictures, boxes, reliefs, rises)
+            self._solved = _Pictures(frame.solved_version, (width, height), border_px, pictures, boxes, reliefs, rises)
         return self._solved
 
     def _prepared_flat(self, frame: PanelFrame) -> _Pictures:
@@ -203,21 +242,23 @@ class ProcessorPainter:
             pictures = tuple(
                 _registered(picture, mounting, screen_px=_size_px(screen))
                 for picture, mounting, screen in zip(
-                    self._prepared(frame.flat, border_px=0)[0], self._mountings, self._screens, strict=True
+                    self._prepared(frame.flat, self._flat_memory, border_px=0)[0],
+                    self._mountings,
+                    self._screens,
+                    strict=True,
                 )
             )
             self._flat = _Pictures(frame.flat_version, size_px, 0, pictures, tuple(map(_whole, pictures)))
         return self._flat
 
     def _prepared(
-        self, layers: U8, *, border_px: int, extended: bool = False
+        self, layers: U8, memory: _PictureMemory, *, border_px: int, extended: bool = False
     ) -> tuple[tuple[U8, ...], tuple[PixelRect, ...]]:
         """Turn layers for the monitors, and surround them with the rest code.
 
-        Layers of the same size and border reuse the memory of the last ones.
-
         Args:
             layers: (N, h, w, 4) RGBA layers.
+            memory: Memory for the pictures, which replace those last prepared there.
             border_px: Width of the border.
             extended: True to repeat the layers' edge pixels in the innermost pixel of the border.
 
@@ -225,12 +266,7 @@ class ProcessorPainter:
             The pictures, and in each the box of the pixels that differ from the rest code.
         """
         turned = [mounting.on_screen(layer) for layer, mounting in zip(layers, self._mountings, strict=True)]
-        key = layers.shape, border_px
-        if key not in self._memory:
-            rest = min(rest_code(len(layers)), 255)
-            border = (border_px,) * 2, (border_px,) * 2, (0, 0)
-            self._memory[key] = tuple(np.pad(picture, border, constant_values=rest) for picture in turned)
-        pictures, boxes = self._memory[key], []
+        pictures, boxes = memory.pictures([_size_px(layer) for layer in turned], border_px=border_px), []
         for picture, layer in zip(pictures, turned, strict=True):
             rows, columns = layer.shape[:2]
             box = (ctypes.c_int32 * 4)()

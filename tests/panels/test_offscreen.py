@@ -10,6 +10,8 @@ import cv2
 import moderngl
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from runtime.clock import SimulatedClock
@@ -368,6 +370,27 @@ def test_on_the_processor_only_panels_that_change_are_drawn() -> None:
     assert list(sink.drawn(PanelFrame(2, layers, 1, moved.solved_from_shown))) == [0, 2]
     assert list(sink.drawn(PanelFrame(3, layers, 1, moved.solved_from_shown))) == []
     assert list(sink.drawn(PanelFrame(4, smooth(2), 2, moved.solved_from_shown))) == [0, 1, 2]
+
+
+@given(st.lists(st.sampled_from([1, 2, 3, 4]), min_size=2, max_size=6))
+def test_on_the_processor_nothing_remains_of_an_earlier_raster(reductions: list[int]) -> None:
+    """Solutions of all rasters share their memory."""
+    moved = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([-0.1, -0.1, 0.05])).solved_from_shown
+    size_px = STACK.width_px, STACK.height_px
+
+    panels = (PanelSettings(rotation_deg=90),) * 3
+
+    def opened() -> ProcessorDrawnPanels:
+        return ProcessorDrawnPanels(clock=SimulatedClock(), size_px=size_px, panels=panels)
+
+    sink = opened()
+    for version, by in enumerate(reductions, start=1):
+        layers = np.ascontiguousarray(smooth(version)[:, ::by, ::by])
+        sink.present(PanelFrame(version, layers, version, moved, size_px=size_px))
+        drawn = sink.read_back()
+    fresh = opened()
+    fresh.present(PanelFrame(version, layers, version, moved, size_px=size_px))
+    assert np.abs(codes(drawn) - codes(fresh.read_back())).max() <= 1  # parts are rounded otherwise than the whole
 
 
 @pytest.mark.parametrize("size_px", [(480, 320), (477, 319)])
