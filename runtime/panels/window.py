@@ -132,7 +132,8 @@ class WindowPanels(PanelSink):
         if fault := display.poll() or watch.look():
             raise PanelLost(fault)
         if unchanged and self._shown and not windows.damaged:
-            return PresentReport(frame.number, self._clock.now_ns(), 0.0)
+            waits_ns = 0 if windows.opengl or due_ns is None else due_ns  # a drawn frame would be shown then
+            return PresentReport(frame.number, max(self._clock.now_ns(), waits_ns), 0.0)
         self._away |= windows.opengl
         windows.draw(frame)
         held_ns = None

@@ -194,6 +194,9 @@ def test_a_frame_drawn_early_is_shown_when_it_is_due(opened: Callable[..., Any])
     report = sink.present(frame(0), due_ns=due_ns)
     assert report.present_ns >= due_ns and report.held_ns > 0
     assert sink.present(frame(1), due_ns=due_ns).held_ns < 100_000_000  # it is late
+    due_ns = time.monotonic_ns() + 200_000_000
+    unchanged = sink.present(frame(1), unchanged=True, due_ns=due_ns)
+    assert unchanged.present_ns == due_ns and unchanged.held_ns is None
 
 
 @PROCESSOR
