@@ -237,6 +237,7 @@ class Tracker:
         again = sample.continued(known.head) if known is not None else None
         if again is not None and last.head.samples < ESTABLISHED and (head is None or again.surprise < head.surprise):
             self._history.clear()  # the viewer's few samples were the mistake
+            self._other = None
             self._follow(again)
             return ""
         if head is not None and head.surprise <= CHI2_DOUBT:
