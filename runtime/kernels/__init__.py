@@ -12,14 +12,16 @@ from __future__ import annotations
 import ctypes
 from functools import cache
 from importlib.machinery import EXTENSION_SUFFIXES
+from math import prod
 from pathlib import Path
 from typing import Any
 
-from numpy.typing import NDArray
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
 
 MAX_PANELS = 5
 MAX_SETS = 4  # maximum number of ray sets: both eyes at two head positions
-MARGIN = 64  # elements past the end of an image's rows that the loops may read or overwrite
+MARGIN = 64  # elements past the end of a row that the loops may read or overwrite, because they use whole vectors
 SUBCODE = 16  # fixed-point units per 8-bit panel code
 FULL = 255 * SUBCODE  # range of a panel value, which rotates the polarization by up to a quarter turn
 EDGE_PX = 4  # maximum distance, in pixels, that an image may be sampled beyond its edge
@@ -31,6 +33,11 @@ _AGAIN = "reinstall phasestack (this requires g++)"
 _pointer, _int, _long, _float, _double = (
     ctypes.c_void_p, ctypes.c_int32, ctypes.c_int64, ctypes.c_float, ctypes.c_double
 )  # fmt: skip
+
+
+def with_margin(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+    """Return an uninitialised array, after whose last row the loops may read and overwrite `MARGIN` elements."""
+    return np.empty(prod(shape) + MARGIN, dtype)[: prod(shape)].reshape(shape)
 
 
 class KernelImage(ctypes.Structure):

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.kernels import MARGIN, MAX_SETS, KernelImage, Panel, Problem, library
+from runtime.kernels import MARGIN, MAX_SETS, KernelImage, Panel, Problem, library, with_margin
 from runtime.model.buffers import LayerBuffer
 from runtime.model.contract import Step
 from runtime.model.geometry import Geometry, inverse
@@ -53,7 +53,9 @@ class CpuState:
         seen = [view.pixels[geometry.rays.slices] for view in job.views]
         self._targets = parallel_map(lambda picture: without_alpha(picture, job.channels), seen)
         across, down = geometry.tapers()
-        self._tapers = [np.rint(TAPER * taper).astype(np.int16) for taper in (np.repeat(across, job.channels), down)]
+        columns: I16 = with_margin((len(across) * job.channels,), np.int16)
+        columns[:] = np.rint(TAPER * np.repeat(across, job.channels))
+        self._tapers = columns, np.rint(TAPER * down).astype(np.int16)
         self._resting = set() if resumed else set(range(self._stack.count))
         return nullcontext()
 

@@ -7,7 +7,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from runtime.kernels import FULL, SUBCODE
+from runtime.kernels import FULL, SUBCODE, with_margin
 from runtime.optics.malus import Branch, phase_from_intensity, rest_code, rest_value
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, I16, U8
@@ -84,12 +84,18 @@ def is_grey(picture: U8) -> bool:
 
 
 def without_alpha(picture: U8, channels: int) -> U8:
-    """Return a contiguous (h, w, 3) picture or, if `channels` is 1, only its first channel (h, w)."""
+    """Return a contiguous (h, w, 3) picture or, if `channels` is 1, only its first channel (h, w).
+
+    The kernels may read past its end (`with_margin`).
+    """
+    codes: U8 = with_margin((*picture.shape[:2], 3)[: 2 + (channels > 1)], np.uint8)
     if channels == 1:
-        return np.asarray(cv2.extractChannel(picture, 0), np.uint8)
-    if picture.shape[2] == 3:
-        return np.ascontiguousarray(picture)
-    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGBA2RGB), np.uint8)
+        cv2.extractChannel(picture, 0, dst=codes)
+    elif picture.shape[2] == 3:
+        np.copyto(codes, picture)
+    else:
+        cv2.cvtColor(picture, cv2.COLOR_RGBA2RGB, dst=codes)
+    return codes
 
 
 def flat_layers(image: U8, stack: PanelStack) -> U8:

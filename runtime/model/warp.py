@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from ctypes import byref, c_double
-from math import prod
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.kernels import EDGE_PX, MARGIN, KernelImage, Warp, library
+from runtime.kernels import EDGE_PX, KernelImage, Warp, library, with_margin
 from runtime.model.chain import EVEN_COLUMNS, ColumnLaw
 from runtime.model.geometry import SNAPPED, TargetView
 from runtime.optics.stack import PlaneRaster
@@ -137,8 +136,7 @@ def warp(
         image = np.asarray(cv2.flip(np.ascontiguousarray(image), 1), np.int16)
         image_from_result = np.array([[-1.0, 0.0, width_px], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]) @ image_from_result
         image_columns = image_columns.mirrored(width_px)
-    elements = prod(image.shape)
-    source: I16 = np.empty(elements + MARGIN, np.int16)[:elements].reshape(image.shape)
+    source: I16 = with_margin(image.shape, np.int16)
     np.clip(image, -LARGEST, LARGEST, out=source)
     result = np.empty((*size, *image.shape[2:]), np.int16)
     channels = result.shape[2] if result.ndim == 3 else 1

@@ -84,6 +84,16 @@ def test_every_instruction_set_makes_the_same_panels(
         assert np.abs(panels - made[0][0]).max() == 0 and (layers == made[0][1]).all()
 
 
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("own", [True, False])
+def test_whatever_the_loops_read_in_whole_vectors_has_a_margin(channels: int, own: bool) -> None:
+    """A read past the last page of a thread's memory ended the process."""
+    state, _, _ = begun(STACKS["three"], eyes(0.4, 0.2), own=own, channels=channels)
+    for array in (*state._targets, state._tapers[0]):
+        assert array.flags.c_contiguous
+        assert array.base is not None and array.base.size >= array.size + kernels.MARGIN
+
+
 def test_a_step_s_symbols_have_one_name_everywhere() -> None:
     """D was `bound` in torch, `curvature` in C++ and GLSL, and either in the mathematics."""
     page = (ROOT / "docs/mathematics.md").read_text(encoding="utf-8")
