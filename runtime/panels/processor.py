@@ -123,7 +123,7 @@ class _Pictures:
 
 
 class _PictureMemory:
-    """Memory for a picture for each panel, whatever the pictures' size.
+    """Memory for a picture of any size for each panel.
 
     It is written to at once, because the first use of memory takes so long that a refresh would be late.
     """
