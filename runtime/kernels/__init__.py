@@ -36,7 +36,7 @@ _pointer, _int, _long, _float, _double = (
 
 
 def with_margin(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-    """Return an uninitialised array, after whose last row the loops may read and overwrite `MARGIN` elements."""
+    """Return an uninitialised array. The loops may use `MARGIN` elements past its end."""
     return np.empty(prod(shape) + MARGIN, dtype)[: prod(shape)].reshape(shape)
 
 

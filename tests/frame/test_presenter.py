@@ -440,7 +440,7 @@ def test_a_calm_head_gets_longer_solutions_within_a_second() -> None:
     assert asked[-1] == 2
 
 
-def test_a_head_that_has_rested_gets_the_solutions_of_one_that_never_moved() -> None:
+def test_a_head_that_has_rested_counts_as_one_that_never_moved() -> None:
     """The speed before the rest says nothing about a head that stirs after it."""
 
     def asked(before: Callable[[float], Any]) -> list[int]:
