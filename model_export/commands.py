@@ -33,7 +33,7 @@ Options = Annotated[
 
 
 def train(
-    out: Annotated[Path, typer.Option(file_okay=False, help="folder for checkpoint.pth, curve.csv and curve.png")],
+    out: Annotated[Path, typer.Option(help="folder for checkpoint.pth, curve.csv and curve.png")],
     arch: Arch,
     option: Options = None,
     data: Annotated[
@@ -69,8 +69,10 @@ def train(
     require("torch")
     from model_export.train import Training, run_training
     from runtime.config import validated
+    from runtime.support.artifacts import refuse_file
     from runtime.support.figures import shown
 
+    refuse_file(out)
     settings = {
         "arch": arch,
         "options": options_of(option),

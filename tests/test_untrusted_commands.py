@@ -54,6 +54,8 @@ def folder(tmp_path: Path) -> Path:
         ("calibrate solve --pairs {folder}/good.csv --out {long}.toml", "File name too long"),
         ("identify --config {long}.toml", "File name too long"),
         ("record --motion walk --out {folder}/a.txt", "a.txt: --out: must end in .mcap"),
+        ("report --out {folder}/good.csv", "good.csv: --out: is a file"),
+        ("train --arch unrolled --out {folder}/good.csv", "good.csv: --out: is a file"),
     ],
 )
 @pytest.mark.timeout(60)

@@ -9,9 +9,7 @@ import typer
 
 
 def report(
-    out: Annotated[Path, typer.Option(file_okay=False, help="folder for index.html, report.json and the plots")] = Path(
-        "report"
-    ),
+    out: Annotated[Path, typer.Option(help="folder for index.html, report.json and the plots")] = Path("report"),
     pairs: Annotated[Path | None, typer.Option(help="folder containing case files for your own stereo pairs")] = None,
     focal: Annotated[bool, typer.Option("--focal", help="also measure focal parallax through the layers")] = False,
     model: Annotated[list[str] | None, typer.Option(help="additional ONNX file to compare (can be repeated)")] = None,
@@ -29,9 +27,10 @@ def report(
     Example: phasestack report --pairs my-pairs --out report
     """
     from runtime.report.assemble import whole_report
-    from runtime.support.artifacts import to_json
+    from runtime.support.artifacts import refuse_file, to_json
     from runtime.support.progress import status_line
 
+    refuse_file(out)
     parts = ["phasestack report", *([f"--pairs {pairs.name}"] if pairs else []), *(["--focal"] if focal else [])]
     parts += [f"--model {Path(name).name}" for name in model or []]
     parts += ["--quick"] if quick else []

@@ -135,7 +135,7 @@ class Aim:
             return
         expected_m2 = self._expected.get(shown.solved_for_ns, 0.0)
         if expected_m2 > 0.0 and eyes.eyes_m is not None and eyes.label != "held":
-            eyes_m = selected_eyes(eyes.eyes_m, shown.seeing)  # otherwise, an eye left out would count as movement
+            eyes_m = selected_eyes(eyes.eyes_m, shown.seeing)  # otherwise, an unseen eye would count as movement
             found_m2 = float(((shown.solved_for_m - eyes_m).mean(axis=0) ** 2).sum())
             self._chooser.foresight.learn(expected_m2=expected_m2, found_m2=found_m2)
         if shown.number != self._learned and shown.measures is not None and shown.effort is not None:
@@ -194,7 +194,7 @@ class Aim:
         return HORIZON_S + (timing.photon_ns - self._calm_ns) / NS_PER_S
 
     def _usual_speed_m_s(self, moved_m: float, eyes: EyesEstimate) -> float:
-        """Return the head's current speed or the RMS of its recent speed, whichever is larger.
+        """Return the larger of the head's current speed and the RMS of its recent speed.
 
         The RMS is needed at turning points, where the current speed is zero, and while the eyes are lost.
         """

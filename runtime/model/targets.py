@@ -88,7 +88,8 @@ def without_alpha(picture: U8, channels: int) -> U8:
 
     The kernels may read past its end (`with_margin`).
     """
-    codes: U8 = with_margin((*picture.shape[:2], 3)[: 2 + (channels > 1)], np.uint8)
+    size = picture.shape[:2]
+    codes: U8 = with_margin(size if channels == 1 else (*size, 3), np.uint8)
     if channels == 1:
         cv2.extractChannel(picture, 0, dst=codes)
     elif picture.shape[2] == 3:

@@ -125,7 +125,7 @@ class _Pictures:
 class _PictureMemory:
     """Memory for a picture of any size for each panel.
 
-    It is written to at once, because the first use of memory takes so long that a refresh would be late.
+    It is filled when created, because memory is slow when first used, which would delay a refresh.
     """
 
     def __init__(self, mountings: Sequence[Mounting]) -> None:

@@ -132,8 +132,10 @@ class WindowPanels(PanelSink):
         if fault := display.poll() or watch.look():
             raise PanelLost(fault)
         if unchanged and self._shown and not windows.damaged:
-            waits_ns = 0 if windows.opengl or due_ns is None else due_ns  # a drawn frame would be shown then
-            return PresentReport(frame.number, max(self._clock.now_ns(), waits_ns), 0.0)
+            shown_ns = self._clock.now_ns()
+            if due_ns is not None and not windows.opengl:  # a drawn frame would be held until then
+                shown_ns = max(shown_ns, due_ns)
+            return PresentReport(frame.number, shown_ns, 0.0)
         self._away |= windows.opengl
         windows.draw(frame)
         held_ns = None

@@ -133,6 +133,12 @@ def write_png(path: Path, image: U8) -> None:
     write_bytes(path, png_bytes(image))
 
 
+def refuse_file(out: Path) -> None:
+    """Raise InputError if a file exists where the output folder must go."""
+    if out.exists() and not out.is_dir():
+        raise InputError(out, "--out", "is a file; pass the name of a folder")
+
+
 class OutputFolder:
     """Output folder whose new files appear all at once at the end, or not at all.
 

@@ -376,9 +376,7 @@ def test_on_the_processor_only_panels_that_change_are_drawn() -> None:
 def test_on_the_processor_nothing_remains_of_an_earlier_raster(reductions: list[int]) -> None:
     """Solutions of all rasters share their memory."""
     moved = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([-0.1, -0.1, 0.05])).solved_from_shown
-    size_px = STACK.width_px, STACK.height_px
-
-    panels = (PanelSettings(rotation_deg=90),) * 3
+    size_px, panels = (STACK.width_px, STACK.height_px), (PanelSettings(rotation_deg=90),) * 3
 
     def opened() -> ProcessorDrawnPanels:
         return ProcessorDrawnPanels(clock=SimulatedClock(), size_px=size_px, panels=panels)
