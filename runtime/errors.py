@@ -145,7 +145,14 @@ def is_retryable(error: BaseException | None) -> bool:
     the chain of causes and contexts.
     """
     while error is not None:
-        if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno in PASSING):
+        if is_out_of_memory(error) or (isinstance(error, OSError) and error.errno in PASSING):
             return True
         error = error.__cause__ or error.__context__
     return False
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Return True for a MemoryError, ENOMEM, or an import for whose shared library there is no memory."""
+    if isinstance(error, ImportError):  # the dynamic linker reports no error number
+        return any(reason in str(error) for reason in ("failed to map segment", "cannot allocate memory"))
+    return isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -144,3 +145,18 @@ def test_an_interrupt_during_an_import_ends_the_command(module: str) -> None:
     replay = ["run", "--replay", "demo", "--headless", "--max-speed", "--frames", "1", "--scale", "0.1"]
     done = run(module, *replay, code=INTERRUPTED_IMPORT)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+
+
+@pytest.mark.parametrize("mib", [600, 900])
+def test_too_little_memory_at_the_start_may_pass(mib: int, tmp_path: Path) -> None:
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_AS, (mib << 20, mib << 20))
+
+    answer = run("run", "--replay", "demo", "--headless", "--frames", "2", home=tmp_path, preexec_fn=limit)
+    assert answer.returncode == 75 and "memory" in answer.stderr.splitlines()[-1], answer.stderr
+
+
+def test_a_crash_in_a_library_leaves_the_python_stack(tmp_path: Path) -> None:
+    answer = broken("import ctypes; ctypes.string_at(0)", tmp_path)
+    assert answer.returncode == -signal.SIGSEGV
+    assert "Segmentation fault" in answer.stderr and "in broken" in answer.stderr

@@ -9,6 +9,7 @@ from __future__ import annotations
 import atexit
 import contextlib
 import errno
+import faulthandler
 import os
 import signal
 import sys
@@ -27,6 +28,7 @@ def run_guarded(*, interrupts_leave: bool) -> None:
             raises KeyboardInterrupt. False leaves the handling of Ctrl-C unchanged.
     """
     _fill_standard_descriptors()
+    faulthandler.enable()  # if a library crashes, every thread's Python stack is in the log
     try:
         from runtime.commands.app import app
         from runtime.support.crash import watch_threads
@@ -78,7 +80,7 @@ def _code_of(app: Any) -> int:
 
 def _reported(error: BaseException) -> int:
     """Print, in one line, the error that ended a command, and return the exit code."""
-    from runtime.errors import PhasestackError, TransientError, one_line
+    from runtime.errors import PhasestackError, TransientError, is_out_of_memory, one_line
     from runtime.support.extras import missing_extra
 
     error = missing_extra(error) or error
@@ -92,7 +94,7 @@ def _reported(error: BaseException) -> int:
     if isinstance(error, PhasestackError):
         _say(f"phasestack: {one_line(str(error), most=2000)}")
         return MAY_PASS if isinstance(error, TransientError) else BAD_INPUT
-    if isinstance(error, MemoryError):
+    if is_out_of_memory(error):
         _say("phasestack: out of memory; close other programs and try again")
         return MAY_PASS
     from runtime.support.crash import written

@@ -79,18 +79,19 @@ class RunningSolver:
     def simulated_costs(self) -> Costs:
         return simulated_costs(self.run.state.settings.loop.simulated_stage_ms, self.run.state.predictor.reductions)
 
-    def first_costs(self) -> Mapping[int, Mapping[str, float]]:
+    def first_costs(self, *, time_ns: int) -> Mapping[int, Mapping[str, float]]:
         predictor = self.run.state.predictor
         if self._calibrated is None or self._calibrated[0] is not predictor:
-            self._calibrated = predictor, self._trial_costs(predictor)
+            self._calibrated = predictor, self._trial_costs(predictor, time_ns=time_ns)
         return self._calibrated[1]
 
-    def _trial_costs(self, predictor: Predictor) -> Mapping[int, Mapping[str, float]]:
+    def _trial_costs(self, predictor: Predictor, *, time_ns: int) -> Mapping[int, Mapping[str, float]]:
         """Return each raster's shortest stage times. If the content cannot be drawn yet, return those of warm-up."""
         costs: dict[int, dict[str, float]] = {}
         try:
             for reduction in predictor.reductions:
-                runs = [self.solver.trial_ms(np.array(EYES_M), reduction) for _ in range(TRIALS[reduction > 1])]
+                eyes_m, count = np.array(EYES_M), TRIALS[reduction > 1]
+                runs = [self.solver.trial_ms(eyes_m, reduction, time_ns=time_ns) for _ in range(count)]
                 costs[reduction] = {stage: min(run.get(stage, 0.0) for run in runs) for stage in runs[0]}
         except ContextLost:
             raise

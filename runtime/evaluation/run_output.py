@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import queue
+import shutil
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -22,6 +23,7 @@ log = logging.getLogger("phasestack.output")
 
 Work = Callable[[], object]
 WAITING = 4096  # maximum number of queued jobs, enough for a minute of lines
+RESERVED_BYTES = 64 << 10  # disk space kept for summary.json
 WAITING_PICTURES = 4  # maximum number of queued jobs that hold a refresh's pictures, which take 25 MB per job at 1080p
 
 
@@ -29,8 +31,8 @@ class RunOutput:
     """Writer that puts a run's files in a folder, where they all appear together after a clean exit.
 
     A background thread writes the files, so that refreshes do not wait for the disk. If the disk fails during the run
-    (full, gone, permission lost), the files are discarded and the run continues. The reason is logged once and kept in
-    `problem`.
+    (full, gone, permission lost), writing stops and the run continues. The reason is logged once and kept in `problem`.
+    Complete lines of frames.jsonl and complete pictures are kept, and space is reserved for summary.json.
     """
 
     def __init__(self, target: Path, *, every_one: bool = True) -> None:
@@ -47,14 +49,15 @@ class RunOutput:
         self._work: queue.Queue[tuple[Work, Work] | None] = queue.Queue(WAITING)
         self._pictures = threading.BoundedSemaphore(WAITING_PICTURES)
         self._writer = threading.Thread(target=self._write, name="output", daemon=True)
-        self.problem = ""  # why the files were discarded; empty while the disk works
+        self.problem = ""  # why writing stopped; empty while the disk works
         self.left_out = 0  # lines and pictures dropped because the disk was too slow
 
     def __enter__(self) -> RunOutput:
         """Create the folder and start the writing thread. Raises InputError if the folder is not writable."""
         self._folder.__enter__()
         try:
-            self._lines = (self._folder.staging / "frames.jsonl").open("w", encoding="utf-8")
+            self._reserve.write_bytes(bytes(RESERVED_BYTES))
+            self._lines = self._lines_path.open("w", encoding="utf-8", buffering=1)  # a line at a time
         except OSError as error:
             self._folder.__exit__(InputError, None, None)
             raise InputError(self._target, "", f"cannot be written: {error.strerror}") from None
@@ -70,9 +73,18 @@ class RunOutput:
             log.warning(
                 "output: dropped %d lines or pictures of %s because the disk was too slow", self.left_out, self._target
             )
+        self._reserve.unlink(missing_ok=True)
         if self.problem:
-            kind = kind or InputError  # so that the folder discards its incomplete files
+            self._attempt(self._drop_incomplete)
         self._attempt(lambda: self._folder.__exit__(kind, error, trace))
+
+    @property
+    def _lines_path(self) -> Path:
+        return self._folder.staging / "frames.jsonl"
+
+    @property
+    def _reserve(self) -> Path:
+        return self._folder.staging / ".reserve"
 
     def refresh(self, line: Mapping[str, Any]) -> None:
         """Queue a line for frames.jsonl. The caller must not modify the line's arrays afterwards."""
@@ -127,7 +139,7 @@ class RunOutput:
     def finish(
         self, summary: dict[str, Any], layers: U8 | None, moment: Moment | None = None, *, unseen: str = ""
     ) -> None:
-        """Queue the files to be written at the end of a run.
+        """Queue the files to be written at the end of a run. After a disk failure, write only summary.json.
 
         Args:
             summary: Contents of summary.json.
@@ -139,7 +151,7 @@ class RunOutput:
         def write() -> None:
             folder = self._folder.staging
             write_json(folder / "summary.json", summary)
-            if layers is None:
+            if layers is None or self.problem:
                 return
             parallel_map(lambda n: write_png(folder / f"layer-{n}.png", layers[n]), range(len(layers)))
             shown, title, lines, page = layers, headline(None), [in_one_line(summary)], unseen
@@ -152,7 +164,7 @@ class RunOutput:
             write_png(folder / "contact-sheet.png", contact_sheet(shown, views, headline=title, lines=lines))
             write_text(folder / "viewer.html", page)
 
-        self._work.put((write, lambda: None))
+        self._work.put((lambda: None, lambda: self._attempt(write)))  # also after a failure
 
     def _pictures_later(self, work: Work) -> None:
         """Queue a job with pictures. If WAITING_PICTURES jobs are queued, wait or drop the job."""
@@ -193,17 +205,30 @@ class RunOutput:
         try:
             work()
         except (OSError, InputError) as error:
-            self._abandon(str(error), trace=False)
+            self._stop(str(error), trace=False)
         except Exception as error:  # a bug in a job must not end the run either
-            self._abandon(f"{type(error).__name__}: {error}", trace=True)
+            self._stop(f"{type(error).__name__}: {error}", trace=True)
 
-    def _abandon(self, why: str, *, trace: bool) -> None:
+    def _stop(self, why: str, *, trace: bool) -> None:
         if self.problem:
             return
         why = why.replace(str(self._folder.staging), str(self._target))  # name the final file, not the staged one
         self.problem = why
-        log.warning("output: abandoned without writing to %s: %s", self._target, why, exc_info=trace)
-        self._folder.discard()  # immediately, because the files may be filling the disk
+        log.warning("output: stopped writing to %s: %s", self._target, why, exc_info=trace)
+        self._reserve.unlink(missing_ok=True)
+
+    def _drop_incomplete(self) -> None:
+        """Remove the incomplete last line of frames.jsonl and incomplete sets of layers or targets."""
+        with self._lines_path.open("r+b") as lines:
+            written = lines.read()
+            lines.truncate(written.rfind(b"\n") + 1)
+        layers = {light: len(list(light.glob("layer-*"))) for light in (self._folder.staging / "light").glob("*")}
+        for light, count in layers.items():
+            if count < max(layers.values()):
+                shutil.rmtree(light)
+            elif not (light / "light.json").exists():
+                for target in (*light.glob("drawn-*"), *light.glob("true-*")):
+                    target.unlink()
 
     def _line(self, line: Mapping[str, Any]) -> None:
         assert self._lines is not None

@@ -109,12 +109,13 @@ class Solver:
             self._missing = {}  # the latest solution already fulfils the request
         return SolverUpdate(missing=dict(self._missing))
 
-    def trial_ms(self, eyes_m: F64, reduction: int) -> dict[str, float]:
+    def trial_ms(self, eyes_m: F64, reduction: int, *, time_ns: int) -> dict[str, float]:
         """Draw and solve once in one step, discard the result, and return the stage times in milliseconds.
 
         Args:
             eyes_m: (2, 3) left and right eye in frame `stack`.
             reduction: Number to divide the panels' rows and columns by.
+            time_ns: Instant to draw the content at.
 
         Raises:
             ContentFailure: The content could not be drawn.
@@ -125,7 +126,7 @@ class Solver:
         plan = state.settings.plan
         job = drawn_job(
             state.predictor, state.content, eyes_m,
-            time_ns=0, reduction=reduction, trimmed=plan.enabled, in_depth=plan.align,
+            time_ns=time_ns, reduction=reduction, trimmed=plan.enabled, in_depth=plan.align,
         )  # fmt: skip
         watch.lap("render")
         state.predictor.solve(replace(job, steps=1), watch)

@@ -12,7 +12,11 @@ from runtime.frame.effort import Costs
 from runtime.frame.solver import SolverUpdate
 from runtime.records import SolveRequest
 
-FIRST_REQUEST = SolveRequest(0, None, "none", 0.0, flat_wanted=True)  # asks for the flat picture before any refresh
+
+def first_request(now_ns: int) -> SolveRequest:
+    """Return the request for the flat picture that precedes the first refresh."""
+    return SolveRequest(now_ns, None, "none", 0.0, flat_wanted=True)
+
 
 SHOWN_STAGES = ("render", "prepare", "inference", "finish")  # in frames.jsonl, `finish` includes the steps
 
@@ -26,10 +30,11 @@ class SolverParts(Protocol):
     def simulated_costs(self) -> Costs:
         """Return the solution costs that apply on a simulated clock with the current settings."""
 
-    def first_costs(self) -> Mapping[int, Mapping[str, float]]:
+    def first_costs(self, *, time_ns: int) -> Mapping[int, Mapping[str, float]]:
         """Return the times of solutions in milliseconds, keyed by reduction and then stage.
 
-        They are measured at the first call and whenever the model has changed. Called on the solver's thread.
+        They are measured at the first call and whenever the model has changed, with the content as it is at `time_ns`.
+        Called on the solver's thread.
         """
 
     def close(self) -> None:
@@ -88,7 +93,7 @@ class SimulatedSolver(SolverHost):
 
     def __init__(self, parts: SolverParts, clock: Clock) -> None:
         self._parts, self._clock = parts, clock
-        self._news = taken_in(SolverUpdate(), parts.step(FIRST_REQUEST))
+        self._news = taken_in(SolverUpdate(), parts.step(first_request(clock.now_ns())))
         self._posted: tuple[int, SolveRequest] | None = None
         self._under_way: tuple[int, SolverUpdate] | None = None  # completion time in ns, and result
         self._idle_since_ns = clock.now_ns()

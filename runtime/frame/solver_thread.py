@@ -15,7 +15,7 @@ from runtime.clock import NS_PER_MS, NS_PER_S, Clock
 from runtime.errors import ContextLost, FatalError, PhasestackError, Stopped, TransientError
 from runtime.frame.effort import REST, SOLVING_STAGES, CostBook, Costs
 from runtime.frame.solver import SolverUpdate
-from runtime.frame.solver_host import FIRST_REQUEST, SolverHost, SolverParts, Task, taken_in
+from runtime.frame.solver_host import SolverHost, SolverParts, Task, first_request, taken_in
 from runtime.records import Effort, SolveRequest
 from runtime.support.background import SOLVER_NICENESS, ThreadAbandoned, abandon, begin, patience_s, set_niceness
 from runtime.support.memory import give_back
@@ -203,8 +203,8 @@ class SolverThread(SolverHost):
         parts: SolverParts | None = None
         try:
             parts = self._make()
-            attempt.costs = CostBook(parts.first_costs())
-            first = parts.step(FIRST_REQUEST)
+            attempt.costs = CostBook(parts.first_costs(time_ns=self._clock.now_ns()))
+            first = parts.step(first_request(self._clock.now_ns()))
         except BaseException as error:
             if parts is not None:
                 parts.close()
@@ -243,7 +243,7 @@ class SolverThread(SolverHost):
         """Discard the measured costs if a task has replaced the model, because rasters and costs may differ."""
         assert attempt.costs is not None
         attempt.busy_since_ns, attempt.is_at_task = self._clock.now_ns(), True
-        first = parts.first_costs()
+        first = parts.first_costs(time_ns=self._clock.now_ns())
         attempt.busy_since_ns, attempt.is_at_task = 0, False
         if first != attempt.costs.first:
             attempt.costs = CostBook(first)

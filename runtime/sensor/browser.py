@@ -14,6 +14,7 @@ from runtime.clock import NS_PER_MS, NS_PER_S, Clock
 from runtime.errors import SensorLost, SensorTimeout
 from runtime.records import EyePoints, Intrinsics, SensorFrame
 from runtime.sensor.base import Capabilities, DeviceClock, Sensor
+from runtime.support.picture_header import picture_size
 
 AGAIN_NS = NS_PER_S // 30  # the last position is repeated at this interval, because a page reports only movements
 SILENT_NS = 5 * NS_PER_S  # there is no viewer if a page has sent no message for this long
@@ -106,9 +107,7 @@ class BrowserCamera(Sensor):
         coded, page_ms = message
         capture_ns = self._times.host_ns(round(page_ms * NS_PER_MS), arrival_ns=self._clock.now_ns())
         self._link.captured(capture_ns, page_ms)
-        picture: Any = cv2.imdecode(np.frombuffer(coded, np.uint8), cv2.IMREAD_COLOR)
-        if picture is None or max(picture.shape) > PICTURE_MAX_PX:
-            raise SensorTimeout("the page sent a camera picture that cannot be decoded")
+        picture = _decoded(coded)
         self._number += 1
         self._captured_ns = max(capture_ns, self._captured_ns + 1)
         height, width = picture.shape[:2]
@@ -118,3 +117,18 @@ class BrowserCamera(Sensor):
 
     def close(self) -> None:
         """Do nothing, because there is no device to release."""
+
+
+def _decoded(coded: bytes) -> Any:
+    """Return a picture as BGR. Raises SensorTimeout if it is damaged or too large; the size is checked first."""
+    try:
+        width, height = picture_size(coded)
+    except ValueError as error:
+        raise SensorTimeout(f"the page sent a camera picture that {error}") from None
+    if max(width, height) > PICTURE_MAX_PX:
+        size = f"{width} by {height} pixels; the maximum is {PICTURE_MAX_PX}"
+        raise SensorTimeout(f"the page sent a camera picture of {size}")
+    picture: Any = cv2.imdecode(np.frombuffer(coded, np.uint8), cv2.IMREAD_COLOR)
+    if picture is None:
+        raise SensorTimeout("the page sent a camera picture that cannot be decoded")
+    return picture

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import mmap
 import os
 from dataclasses import dataclass
 from functools import cache
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     import moderngl
 
 DEBIAN_PACKAGES = "libegl1 libgl1-mesa-dri libgles2 libgl1"
+DRIVER_BYTES = 256 << 20  # address space for llvmpipe and the libraries that it loads
 MINIMUM_VERSION = 330  # OpenGL 3.3, which the shaders require
 # Given these file names, moderngl need not search for the libraries; a search starts a compiler and takes 60 ms.
 EGL: dict[str, Any] = {"backend": "egl", "libegl": "libEGL.so.1", "libgl": "libGL.so.1"}
@@ -24,8 +26,11 @@ EGL: dict[str, Any] = {"backend": "egl", "libegl": "libEGL.so.1", "libgl": "libG
 def offscreen_context() -> moderngl.Context:
     """Create an offscreen OpenGL context for content and offscreen panels, and make it current.
 
-    Use the context on one thread only. Raises MissingPart, which names the Debian packages to install, if EGL does not
-    provide OpenGL 3.3.
+    Use the context on one thread only.
+
+    Raises:
+        MissingPart: EGL does not provide OpenGL 3.3. The message names the Debian packages to install.
+        MemoryError: There is too little memory for the driver.
     """
     try:
         import moderngl
@@ -37,6 +42,10 @@ def offscreen_context() -> moderngl.Context:
     try:
         return moderngl.create_context(require=MINIMUM_VERSION, standalone=True, **EGL)
     except Exception as error:  # moderngl and glcontext raise plain Exception
+        try:
+            mmap.mmap(-1, DRIVER_BYTES).close()
+        except OSError:
+            raise MemoryError("there is too little memory for an OpenGL driver") from None
         raise MissingPart(
             f"cannot create an OpenGL context without a screen: {str(error).strip() or 'EGL failed'}; "
             f"install the Debian packages {DEBIAN_PACKAGES}"

@@ -5,9 +5,10 @@ from __future__ import annotations
 import importlib.util
 import io
 import struct
+import threading
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -82,8 +83,8 @@ class Header:
 def opened(coded: bytes | IO[bytes]) -> Iterator[Any]:
     """Open a picture with Pillow without decoding the pixels, and yield the Pillow image.
 
-    Pillow's limits are disabled, because the callers apply stricter ones. For invalid pictures, the class of the
-    exception depends on the format.
+    Pillow's limits and warnings are disabled while any picture is open, because the callers apply stricter limits. For
+    invalid pictures, the class of the exception depends on the format.
 
     Args:
         coded: Encoded picture, as bytes or as an open file.
@@ -91,14 +92,35 @@ def opened(coded: bytes | IO[bytes]) -> Iterator[Any]:
     from PIL import Image
 
     file = io.BytesIO(coded) if isinstance(coded, bytes) else coded
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        most, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
-        try:
-            with Image.open(file, formats=_formats()) as image:
-                yield image
-        finally:
-            Image.MAX_IMAGE_PIXELS = most
+    with _UNLIMITED, Image.open(file, formats=_formats()) as image:
+        yield image
+
+
+class _UnlimitedPillow:
+    """Context manager, for any number of threads at once, within which Pillow has no limit and does not warn."""
+
+    def __init__(self) -> None:
+        self._lock, self._users, self._undo = threading.Lock(), 0, ExitStack()
+
+    def __enter__(self) -> None:
+        from PIL import Image
+
+        with self._lock:
+            self._users += 1
+            if self._users == 1:
+                self._undo.enter_context(warnings.catch_warnings())
+                warnings.simplefilter("ignore")
+                self._undo.callback(setattr, Image, "MAX_IMAGE_PIXELS", Image.MAX_IMAGE_PIXELS)
+                Image.MAX_IMAGE_PIXELS = None
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._users -= 1
+            if not self._users:
+                self._undo.close()
+
+
+_UNLIMITED = _UnlimitedPillow()
 
 
 @cache

@@ -7,6 +7,7 @@ import errno
 import json
 import os
 import re
+import subprocess
 import threading
 from pathlib import Path
 from typing import Any
@@ -73,28 +74,38 @@ def test_the_sheet_shows_the_moment_with_the_one_figure_to_quote(
 
 
 class FullDisk:
-    """A file on a disk without room."""
+    """A file on a disk that is full in the middle of its fourth line."""
 
-    def __init__(self) -> None:
-        self.tried = 0
+    def __init__(self, file: Any) -> None:
+        self.file, self.tried = file, 0
 
     def write(self, text: str) -> None:
         self.tried += 1
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        self.file.write(text if self.tried < 4 else text[:9])
+        if self.tried >= 4:
+            self.close()
 
     def close(self) -> None:
+        self.file.close()
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-def test_a_full_disk_abandons_the_files_once_and_the_run_goes_on(
+def test_a_full_disk_keeps_what_was_complete_and_the_run_goes_on(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    disk, opened = FullDisk(), Path.open
-    monkeypatch.setattr(
-        Path, "open", lambda path, *a, **k: disk if path.name == "frames.jsonl" else opened(path, *a, **k)
-    )
+    disks, opened = [], Path.open
+
+    def on_a_full_disk(path: Path, *mode: Any, **rest: Any) -> Any:
+        file = opened(path, *mode, **rest)
+        if path.name != "frames.jsonl" or mode != ("w",):
+            return file
+        disks.append(FullDisk(file))
+        return disks[0]
+
+    monkeypatch.setattr(Path, "open", on_a_full_disk)
     layers, drawn = pictures()
     with RunOutput(tmp_path) as output:
+        output.light(0, layers=layers)
         for frame in range(200):
             output.refresh(line(frame))
         for frame in range(3 * run_output.WAITING_PICTURES):  # none of them waits for a disk that has failed
@@ -102,10 +113,52 @@ def test_a_full_disk_abandons_the_files_once_and_the_run_goes_on(
             output.light_targets(frame, drawn=drawn, true=drawn, info={})
         output.finish(SUMMARY, layers)
     assert "No space left" in output.problem
-    assert [record.message for record in caplog.records if "abandoned" in record.message] != []
-    assert len([record for record in caplog.records if "abandoned" in record.message]) == 1
-    assert disk.tried == 1
-    assert list(tmp_path.iterdir()) == [], "nothing half-written is left"
+    assert len([record for record in caplog.records if "stopped writing" in record.message]) == 1
+    assert disks[0].tried == 4
+    assert sorted(path.name for path in tmp_path.rglob("*") if path.is_file()) == [
+        "frames.jsonl", "layer-0.png", "layer-1.png", "layer-2.png", "summary.json",
+    ]  # fmt: skip
+    assert [json.loads(text)["frame"] for text in (tmp_path / "frames.jsonl").read_text().splitlines()] == [0, 1, 2]
+    assert json.loads((tmp_path / "summary.json").read_text()) == SUMMARY
+
+
+def test_pictures_that_the_disk_had_no_room_for_are_not_left_in_part(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, room = run_output.write_png, iter(range(7))
+
+    def write(path: Path, image: np.ndarray) -> None:
+        if next(room, None) is None:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        real(path, image)
+
+    monkeypatch.setattr(run_output, "write_png", write)
+    layers, drawn = pictures()
+    with RunOutput(tmp_path) as output:
+        for frame in range(2):
+            output.light(frame, layers=layers)
+        output.light_targets(0, drawn=drawn, true=drawn, info={})
+        output.finish(SUMMARY, layers)
+    kept = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()}
+    assert kept == {"frames.jsonl", "summary.json"} | {f"light/{f}/layer-{n}.png" for f in range(2) for n in range(3)}
+
+
+def test_a_disk_that_is_really_full_still_has_room_for_the_summary(tmp_path: Path) -> None:
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=512k", "none", disk], capture_output=True).returncode:
+        pytest.skip("only root can mount a small disk")
+    try:
+        with RunOutput(disk / "out") as output:
+            for frame in range(4000):
+                output.refresh(line(frame, reason="x" * 100))
+            output.finish(SUMMARY, None)
+        assert "No space left" in output.problem
+        lines = (disk / "out/frames.jsonl").read_text().splitlines()
+        assert [json.loads(text)["frame"] for text in lines] == list(range(len(lines))) and len(lines) > 100
+        assert json.loads((disk / "out/summary.json").read_text()) == SUMMARY
+    finally:
+        subprocess.run(["umount", disk], check=True)
 
 
 def test_where_lines_may_be_dropped_a_slow_disk_delays_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -146,6 +146,7 @@ class FakeParts:
         self.behave, self.stage_ms = step, stage_ms or {}
         self.asked: list[SolveRequest] = []
         self.closed = 0  # times
+        self.costs_at_ns: list[int] = []
 
     def step(self, request: SolveRequest) -> SolverUpdate:
         self.asked.append(request)
@@ -154,7 +155,8 @@ class FakeParts:
     def simulated_costs(self) -> Costs:
         return simulated_costs(self.stage_ms, (1,))
 
-    def first_costs(self) -> dict[int, dict[str, float]]:
+    def first_costs(self, *, time_ns: int) -> dict[int, dict[str, float]]:
+        self.costs_at_ns.append(time_ns)
         return {1: {}}
 
     def close(self) -> None:

@@ -133,6 +133,12 @@ def shop() -> Iterator[Workshop]:
     made.close()
 
 
+def test_measurements_and_the_first_picture_have_the_clocks_time(shop: Workshop) -> None:
+    shop.settle()
+    (parts,) = shop.all
+    assert {*parts.costs_at_ns, parts.asked[0].time_ns} == {shop.clock.now_ns()}
+
+
 def test_parts_live_on_one_thread_that_is_not_the_presenter_s(shop: Workshop) -> None:
     threads = []
     shop.behave = lambda request: (threads.append(threading.current_thread().name), solves(request))[1]
@@ -396,7 +402,7 @@ def test_parts_that_were_abandoned_in_a_task_time_nothing_afterwards(shop: Works
     parts: Any = shop.all[0]
     shop.host.do(lambda parts: bool(begun.set()) or gate.wait(PATIENCE_S))
     assert begun.wait(PATIENCE_S)
-    parts.first_costs = lambda: timed.append(threading.current_thread().name) or {1: {"finish": 1e3}}
+    parts.first_costs = lambda *, time_ns: timed.append(threading.current_thread().name) or {1: {"finish": 1e3}}
     shop.pass_s(LIMITS.load_s)
     shop.left()
     gate.set()
@@ -450,7 +456,7 @@ def test_after_a_change_of_the_model_its_own_rasters_are_timed(shop: Workshop) -
     shop.solve(1)
     assert set(shop.host.costs.stages) == {1}
     parts: Any = shop.all[0]
-    parts.first_costs = lambda: {1: {"finish": 40.0}, 2: {"finish": 10.0}}
+    parts.first_costs = lambda *, time_ns: {1: {"finish": 40.0}, 2: {"finish": 10.0}}
     shop.host.do(lambda _: True)
     shop.solve(2)
     assert set(shop.host.costs.stages) == {1, 2}

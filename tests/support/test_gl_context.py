@@ -18,3 +18,13 @@ def test_without_a_context_packages_are_named(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(moderngl, "create_context", refused)
     with pytest.raises(MissingPart, match=r"libgl1$"):
         gl.offscreen_context()
+
+
+def test_a_driver_without_memory_is_not_taken_for_a_missing_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(**_: Any) -> None:
+        raise Exception("eglInitialize failed (0x3001)")
+
+    monkeypatch.setattr(moderngl, "create_context", refused)
+    monkeypatch.setattr(gl, "DRIVER_BYTES", 1 << 62)
+    with pytest.raises(MemoryError, match="too little memory"):
+        gl.offscreen_context()

@@ -6,8 +6,9 @@ import cv2
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
-from runtime.support.picture_header import PNG, is_cut_off
+from runtime.support.picture_header import PNG, is_cut_off, opened
 
 COLOURS = np.random.default_rng(0).integers(0, 256, (12, 16, 3), np.uint8)
 
@@ -35,3 +36,14 @@ def test_a_part_that_promises_more_than_there_is_cuts_it_off(promised: int) -> N
     """Seen: 2,817 bytes that promised 1.9 GB took them."""
     place = WHOLE.index(b"IDAT") - 4
     assert is_cut_off(WHOLE[:place] + promised.to_bytes(4, "big") + WHOLE[place + 4 :])
+
+
+def test_pillow_has_its_limit_again_when_the_last_of_several_users_leaves() -> None:
+    limit = Image.MAX_IMAGE_PIXELS
+    first, second = opened(WHOLE), opened(WHOLE)
+    first.__enter__()
+    second.__enter__()
+    first.__exit__(None, None, None)
+    assert Image.MAX_IMAGE_PIXELS is None  # the second is still reading
+    second.__exit__(None, None, None)
+    assert limit is not None and limit == Image.MAX_IMAGE_PIXELS
