@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import resource
 import shutil
+import socket as sockets
 import struct
 import subprocess
 import sys
 import threading
 import time
+from base64 import b64encode
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -173,6 +179,134 @@ def test_a_program_with_the_wrong_size_is_told_why_and_may_return(source: Any) -
     assert drawn(source)[0].shape == (36, 64, 3) and source.problem == ""
     again.end()
     assert eventually(lambda: source.problem == "the program closed the connection")
+
+
+@pytest.mark.parametrize(
+    ("head", "size_bytes", "why"),
+    [
+        ((0,), 4 * 128 * 72, "the answer has 36864 bytes, which is not 64x36 RGBA pixels"),
+        ((2,), 4 * 64 * 36, "the answer is for eye 2; the left eye is 0 and the right eye is 1"),
+        ((), 0, "the answer is not a picture"),
+    ],
+)
+def test_a_program_is_told_by_the_close_message_what_was_wrong(
+    source: Any, head: tuple[int, ...], size_bytes: int, why: str
+) -> None:
+    with connect(source.program["address"], max_size=None, compression=None) as socket:
+        socket.send(json.dumps({"name": "test"}))
+        asking = threading.Thread(target=lambda: eventually(lambda: _draws(source) or bool(source.problem)))
+        asking.start()
+        frame = json.loads(socket.recv(10))["frame"]
+        socket.send(struct.pack(f"<{1 + len(head)}I", frame, *head) + bytes(size_bytes))
+        with pytest.raises(ConnectionClosed) as told:
+            while True:
+                socket.recv(10)
+    asking.join()
+    assert told.value.rcvd is not None and (told.value.rcvd.code, told.value.rcvd.reason) == (1007, why)
+    assert source.problem == why
+
+
+def test_a_picture_that_was_not_asked_for_is_left(source: Any) -> None:
+    program = Program(source, lambda asked, eye: picture_of(asked, eye) if eye["eye"] == "left" else None)
+    view = raster_views(EYES, STACK.panel(0))[1]
+    source.expect([view], time_ns=0)
+    with pytest.raises(ContentFailure, match="did not answer"):  # it answers for the left eye
+        source.render(view, time_ns=0)
+    program.end()
+
+
+class Silent:
+    """A client that has a small buffer and reads only when it is told to."""
+
+    def __init__(self, source: Any) -> None:
+        parts = urlsplit(source.program["address"])
+        self._socket = sockets.socket()
+        self._socket.setsockopt(sockets.SOL_SOCKET, sockets.SO_RCVBUF, 2048)
+        self._socket.settimeout(10)
+        self._socket.connect((parts.hostname, parts.port))
+        head = "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13"
+        key = b64encode(bytes(16)).decode()
+        request = f"GET /?{parts.query} HTTP/1.1\r\nHost: x\r\n{head}\r\nSec-WebSocket-Key: {key}\r\n\r\n"
+        self._socket.sendall(request.encode())
+        self.received = b""
+        while b"\r\n\r\n" not in self.received:
+            self.received += self._socket.recv(1)
+
+    def say(self, hello: str) -> None:
+        self._socket.sendall(bytes([0x81, 0x80 | len(hello), 0, 0, 0, 0]) + hello.encode())  # masked by zeros
+
+    def frames_read(self) -> list[int]:
+        with suppress(TimeoutError):
+            self._socket.settimeout(1)
+            while data := self._socket.recv(1 << 20):
+                self.received += data
+        return [int(number) for number in re.findall(rb'"frame": (\d+)', self.received)]
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+@pytest.mark.slow
+def test_a_listener_that_reads_nothing_loses_only_its_own_messages(source: Any) -> None:
+    listener, program = Silent(source), Program(source)
+    listener.say('{"listens": true}')
+    for _ in range(4000):  # 6 MB of requests, more than the system buffers
+        assert len(drawn(source)) == 2
+    numbers = listener.frames_read()
+    assert numbers == sorted(numbers) and len(numbers) < 3900 and numbers[-1] == program.asked[-1]["frame"]
+    listener.close()
+    program.end()
+
+
+def test_many_connections_without_a_handshake_keep_nobody_out(source: Any) -> None:
+    port, before = urlsplit(source.program["address"]).port, threading.active_count()
+    idle = [sockets.create_connection(("127.0.0.1", port)) for _ in range(300)]
+    assert eventually(lambda: sum(is_closed(one) for one in idle) >= 300 - 16)
+    assert threading.active_count() == before
+    program = Program(source)
+    assert len(drawn(source)) == 2
+    program.end()
+    for one in idle:
+        one.close()
+
+
+def is_closed(socket: sockets.socket) -> bool:
+    socket.setblocking(False)
+    try:
+        return socket.recv(1) == b""
+    except BlockingIOError:
+        return False
+    except ConnectionError:
+        return True
+
+
+def test_connections_are_accepted_again_after_too_many_open_files(source: Any, caplog: Any) -> None:
+    client = sockets.socket()
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with caplog.at_level("ERROR", logger="asyncio"):
+        resource.setrlimit(resource.RLIMIT_NOFILE, (client.fileno() + 1, limits[1]))
+        try:
+            client.connect(("127.0.0.1", urlsplit(source.program["address"]).port))
+            assert eventually(lambda: "out of system resource" in caplog.text)
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+    client.close()
+    program = Program(source)
+    assert len(drawn(source)) == 2
+    program.end()
+
+
+def test_the_address_stays_the_same_when_the_scene_is_opened_again(source: Any) -> None:
+    address, program = source.program["address"], Program(source)
+    again = open_content(ContentSettings(scene="program"), STACK, None)  # as a reload does, before it closes the first
+    source.close()
+    assert again.program is not None and again.program["address"] == address
+    assert len(drawn(again)) == 2
+    again.close()
+    assert program.ended.wait(10)
+    later = open_content(ContentSettings(scene="program"), STACK, None)
+    assert later.program is not None and later.program["address"] == address
+    later.close()
 
 
 def test_the_newest_program_draws(source: Any) -> None:

@@ -1,0 +1,401 @@
+"""Server for programs that draw: it passes on requests and keeps the newest pictures.
+
+It runs an event loop on a separate thread. No caller waits for a program: `ask` only leaves a request, and a
+program that reads slowly loses only its own messages. docs/programs.md describes the protocol.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import json
+import logging
+import secrets
+import socket as sockets
+import struct
+import threading
+import time
+from collections import deque
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import numpy as np
+from websockets.asyncio.server import ServerConnection, serve
+from websockets.exceptions import ConnectionClosed
+
+from runtime.clock import NS_PER_S
+from runtime.errors import ContentFailure, InputError, one_line
+from runtime.records import U8
+from runtime.support.background import begin
+
+log = logging.getLogger("phasestack.content")
+library_log = logging.getLogger("phasestack.websockets")  # the library describes each failed handshake by a traceback
+library_log.setLevel(logging.CRITICAL)
+
+HOST = "127.0.0.1"
+ANSWERED_S = 0.4  # time limit for all of a frame's pictures
+GIVEN_UP_S = 2.0  # an unanswered frame is abandoned after this time
+IN_FLIGHT_MAX = 2  # largest number of frames requested but not yet answered
+HELLO_S = 5.0  # time limit for the handshake, and for a program's greeting
+CLOSED_WITHIN_S = 1.0  # time limit for a program to close its connection, after it was told why
+HALF_OPEN_MAX = 16  # largest number of connections without a handshake; the oldest is closed
+CONNECTIONS_MAX = 32  # largest number of connected programs
+QUEUED_MAX = 4  # largest number of messages that the library holds for each connection
+HEAD = struct.Struct("<II")  # an answer's header: frame number and side (0 left, 1 right)
+SIDES = ("left", "right")
+MESSAGE_MAX_BYTES = 8 * 7680 * 4320 + HEAD.size
+WRONG_DATA, LEAVING, TOO_BIG = 1007, 1001, 1009  # close codes of RFC 6455
+
+
+@dataclass(frozen=True, slots=True)
+class AskedViews:
+    """Views that programs are asked to draw, in the form sent to them."""
+
+    time_ns: int  # on the run's clock
+    width_px: int
+    height_px: int
+    eyes: tuple[dict[str, Any], ...]  # see `program.camera_of`; `eye` is left or right
+
+    @property
+    def sides(self) -> tuple[int, ...]:
+        return tuple(SIDES.index(eye["eye"]) for eye in self.eyes)
+
+
+@dataclass(frozen=True, slots=True)
+class DrawnPictures:
+    """A frame's complete set of pictures."""
+
+    number: int  # of the frame, as returned by `ask`
+    pictures: Mapping[int, U8]  # RGBA (h, w, 4) with the top row first, keyed by side
+
+
+@dataclass(slots=True)
+class _Frame:
+    """A frame requested from a program, with the pictures received so far."""
+
+    asked: AskedViews
+    asked_s: float  # request time on the monotonic clock
+    pictures: dict[int, U8] = field(default_factory=dict)  # keyed by side
+
+
+class _Connection(ServerConnection):
+    """Connection that is closed before its handshake if many younger ones also wait for theirs."""
+
+    def __init__(self, *args: Any, waiting: dict[_Connection, None], **options: Any) -> None:
+        super().__init__(*args, **options)
+        self._waiting = waiting
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(transport)
+        self._waiting[self] = None
+        if len(self._waiting) > HALF_OPEN_MAX:
+            oldest = next(iter(self._waiting))
+            oldest.shaken()
+            oldest.transport.abort()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self.shaken()
+        super().connection_lost(exc)
+
+    def shaken(self) -> None:
+        """Declare that the connection no longer waits for its handshake."""
+        self._waiting.pop(self, None)
+
+
+class _Client:
+    """A connected program, with the messages that it has not yet taken."""
+
+    def __init__(self, connection: ServerConnection, hello: dict[str, Any]) -> None:
+        self.connection = connection
+        self.listens = bool(hello.get("listens"))
+        self.bottom_up = hello.get("rows") == "bottom-up"
+        self.name = one_line(str(hello.get("name", "unnamed")), most=80)
+        self._messages: deque[str] = deque(maxlen=1 if self.listens else IN_FLIGHT_MAX)
+        self._has_messages = asyncio.Event()
+
+    def post(self, message: str) -> None:
+        """Leave a message for the program. A message that is not taken in time is replaced by later ones."""
+        self._messages.append(message)
+        self._has_messages.set()
+
+    async def send(self) -> None:
+        """Send messages as fast as the program reads them, until the connection is closed."""
+        with suppress(ConnectionClosed):
+            while True:
+                await self._has_messages.wait()
+                self._has_messages.clear()
+                while self._messages:
+                    await self.connection.send(self._messages.popleft())
+
+
+class ProgramServer:
+    """Server that drawing programs connect to in order to receive requests and send pictures.
+
+    The program that connected last does the drawing. Programs that only listen receive the same requests. The methods
+    may be called on any thread. None waits for a program, except for `drawn`.
+    """
+
+    def __init__(self, port: int, token: str) -> None:
+        """Listen on a port of the loopback interface. Raises OSError if the port cannot be opened.
+
+        Args:
+            port: TCP port, or 0 for any free port.
+            token: Secret that an address must contain.
+        """
+        self._token = token
+        self._changed = threading.Condition()  # guards the fields below, up to `_socket`
+        self._drawing: _Client | None = None  # latest drawing program
+        self._frames: dict[int, _Frame] = {}  # requested frames that are incomplete, keyed by number
+        self._count = 0
+        self.newest: DrawnPictures | None = None
+        self.problem = ""  # why the last program was lost; empty: none was
+        self.frame_ms: float | None = None  # time from a recent request to the last picture in the answer
+        self._socket = sockets.create_server((HOST, port))
+        self.port: int = self._socket.getsockname()[1]
+        self.address = f"ws://{HOST}:{self.port}/?token={token}"
+        self._clients: set[_Client] = set()  # used on the loop's thread only, as is everything below
+        self._waiting: dict[_Connection, None] = {}  # connections without a handshake, oldest first
+        self._closing: set[asyncio.Task[None]] = set()
+        self._ends = asyncio.Event()
+        self._loop = asyncio.new_event_loop()
+        begin("programs", self._run)
+        log.info(
+            "waiting for a program to connect; `phasestack status` shows the address to connect to under `program`"
+        )
+
+    def ask(self, asked: AskedViews) -> int:
+        """Request a frame's pictures, and return the frame's number.
+
+        Raises ContentFailure if no program is connected or too many requests are unanswered.
+        """
+        now_s = time.monotonic()
+        with self._changed:
+            self._count += 1
+            number, program = self._count, self._drawing
+            self._frames = {n: frame for n, frame in self._frames.items() if now_s - frame.asked_s < GIVEN_UP_S}
+            is_asked = program is not None and len(self._frames) < IN_FLIGHT_MAX
+            if is_asked:
+                self._frames[number] = _Frame(asked, now_s)
+        message: dict[str, Any] = {"frame": number, "time_s": asked.time_ns / NS_PER_S, "width": asked.width_px}
+        message |= {"height": asked.height_px, "eyes": asked.eyes}
+        self._call(self._post, json.dumps(message), program if is_asked else None)
+        if program is None:
+            why = f" ({self.problem})" if self.problem else ""
+            raise ContentFailure(
+                f"no program is connected{why}; `phasestack status` shows the address to connect to under `program`"
+            )
+        if not is_asked:
+            raise ContentFailure(f"the program is late: {IN_FLIGHT_MAX} requests are unanswered")
+        return number
+
+    def drawn(self, number: int) -> DrawnPictures:
+        """Wait until a frame is complete, and return its pictures.
+
+        Raises ContentFailure if the pictures do not arrive within `ANSWERED_S` or the program disconnects.
+        """
+        with self._changed:
+            frame = self._frames.get(number)
+            if frame is not None:
+                within_s = frame.asked_s + ANSWERED_S - time.monotonic()
+                self._changed.wait_for(lambda: number not in self._frames, within_s)
+            if self.newest is not None and self.newest.number == number:
+                return self.newest
+        raise ContentFailure(self.problem or f"the program did not answer within {1e3 * ANSWERED_S:.0f} ms")
+
+    def close(self) -> None:
+        """Close the port and all connections, soon."""
+        self._call(self._ends.set)
+
+    def _call(self, function: Any, *args: Any) -> None:
+        with suppress(RuntimeError):  # the loop has ended
+            self._loop.call_soon_threadsafe(function, *args)
+
+    # On the loop's thread
+
+    def _run(self) -> None:
+        with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
+            runner.run(self._serve())
+
+    async def _serve(self) -> None:
+        """Accept connections until the end. After an error such as too many open files, asyncio accepts again."""
+        options: dict[str, Any] = {
+            "create_connection": partial(_Connection, waiting=self._waiting),
+            "server_header": None,
+            "logger": library_log,
+        }
+        async with serve(
+            self._connected,
+            sock=self._socket,
+            process_request=self._refused,
+            open_timeout=HELLO_S,
+            close_timeout=CLOSED_WITHIN_S,
+            max_size=MESSAGE_MAX_BYTES,
+            max_queue=QUEUED_MAX,
+            compression=None,
+            **options,
+        ):
+            await self._ends.wait()
+            for connection in tuple(self._waiting):
+                connection.transport.abort()
+
+    def _refused(self, connection: Any, request: Any) -> Any:
+        token = parse_qs(urlsplit(request.path).query).get("token", [""])[0]
+        if not hmac.compare_digest(token.encode(), self._token.encode()):
+            return connection.respond(403, "the token in the address is wrong\n")
+        if len(self._clients) >= CONNECTIONS_MAX:
+            return connection.respond(503, f"{CONNECTIONS_MAX} programs are connected\n")
+        connection.shaken()
+        return None
+
+    def _post(self, message: str, program: _Client | None) -> None:
+        for client in self._clients:
+            if client.listens or client is program:
+                client.post(message)
+
+    async def _connected(self, connection: ServerConnection) -> None:
+        """Serve a connection. A program's first message states whether it draws or only listens."""
+        client: _Client | None = None
+        why = "the program closed the connection"
+        try:
+            async with asyncio.timeout(HELLO_S):
+                hello = json.loads(await connection.recv())
+            if not isinstance(hello, dict):
+                raise ValueError("the first message is not a JSON object")
+            client = _Client(connection, hello)
+            self._welcome(client)
+            sending = asyncio.ensure_future(client.send())
+            try:
+                async for message in connection:
+                    self._take(client, message)
+            finally:
+                sending.cancel()
+        except TimeoutError:
+            pass
+        except ConnectionClosed as error:
+            if error.sent is not None and error.sent.code == TOO_BIG:
+                why = f"a message is larger than {MESSAGE_MAX_BYTES} bytes"
+        except ValueError as error:
+            why = one_line(str(error), most=100)
+            self._lose(client, why)
+            await connection.close(WRONG_DATA, _shortened(why))
+        finally:
+            self._lose(client, why)
+
+    def _welcome(self, client: _Client) -> None:
+        self._clients.add(client)
+        if client.listens:
+            return
+        with self._changed:
+            before, self._drawing = self._drawing, client
+            self.problem = ""
+            self._frames.clear()
+            self._changed.notify_all()
+        log.info("drawing program connected: %s", client.name)
+        if before is not None:
+            closing = asyncio.ensure_future(
+                before.connection.close(LEAVING, _shortened(f"another program has replaced it: {client.name}"))
+            )
+            self._closing.add(closing)
+            closing.add_done_callback(self._closing.discard)
+
+    def _lose(self, client: _Client | None, why: str) -> None:
+        """Forget a client. Has no effect if it was forgotten before."""
+        if client is not None:
+            self._clients.discard(client)
+        with self._changed:
+            if client is None or self._drawing is not client:
+                return
+            self._drawing, self.problem = None, why
+            self._frames.clear()
+            self._changed.notify_all()
+        log.warning("lost the drawing program: %s", why)
+
+    def _take(self, client: _Client, message: str | bytes) -> None:
+        """Store a picture from a program. Raises ValueError if the message is not a picture that was asked for."""
+        if client.listens:
+            return
+        if not isinstance(message, bytes) or len(message) < HEAD.size:
+            raise ValueError("the answer is not a picture")
+        number, side = HEAD.unpack_from(message)
+        if side >= len(SIDES):
+            raise ValueError(f"the answer is for eye {side}; the left eye is 0 and the right eye is 1")
+        with self._changed:
+            frame = self._frames.get(number)
+            if client is not self._drawing or frame is None or side not in frame.asked.sides:
+                return  # the frame was abandoned
+        width, height = frame.asked.width_px, frame.asked.height_px
+        size = len(message) - HEAD.size
+        if size != 4 * width * height:
+            raise ValueError(f"the answer has {size} bytes, which is not {width}x{height} RGBA pixels")
+        picture = np.frombuffer(message, np.uint8, offset=HEAD.size).reshape(height, width, 4)
+        frame.pictures[side] = picture[::-1] if client.bottom_up else picture
+        if len(frame.pictures) == len(frame.asked.eyes):
+            self._complete(number, frame)
+
+    def _complete(self, number: int, frame: _Frame) -> None:
+        with self._changed:
+            if self._frames.pop(number, None) is None:
+                return
+            self.frame_ms = 1e3 * (time.monotonic() - frame.asked_s)
+            if self.newest is None or number > self.newest.number:
+                self.newest = DrawnPictures(number, frame.pictures)
+            self._changed.notify_all()
+
+
+def _shortened(why: str) -> str:
+    """Return a reason that fits in a close message, which holds 123 bytes."""
+    return why.encode("ascii", "replace").decode()[:120]
+
+
+_lock = threading.Lock()
+_servers: dict[int, tuple[ProgramServer, int]] = {}  # open servers and their numbers of users, keyed by the port asked
+_addresses: dict[int, tuple[int, str]] = {}  # port and token of the last server, keyed by the port asked
+
+
+def acquire(port: int) -> ProgramServer:
+    """Return the server for a port. Each caller must later call `release`.
+
+    The address, with the token, stays the same for the life of the process if the port is still free, so that programs
+    find the server again after a scene or the solver has been restarted.
+
+    Args:
+        port: TCP port, or 0 for any free port.
+
+    Raises:
+        InputError: The port cannot be opened.
+    """
+    with _lock:
+        server, users = _servers.get(port, (None, 0))
+        if server is None:
+            server = _opened(port)
+        _servers[port] = server, users + 1
+        return server
+
+
+def _opened(port: int) -> ProgramServer:
+    last_port, token = _addresses.get(port, (port, secrets.token_urlsafe(24)))
+    for attempt in (last_port, port):
+        try:
+            server = ProgramServer(attempt, token)
+        except OSError as error:
+            problem = f"cannot listen on port {attempt}: {error.strerror}"
+            continue
+        _addresses[port] = server.port, token
+        return server
+    raise InputError("content.options", "port", problem)
+
+
+def release(server: ProgramServer) -> None:
+    """Give back a server. It is closed when its last user has given it back."""
+    with _lock:
+        for port, (one, users) in tuple(_servers.items()):
+            if one is server:
+                if users > 1:
+                    _servers[port] = server, users - 1
+                    return
+                del _servers[port]
+    server.close()
