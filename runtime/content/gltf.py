@@ -13,7 +13,7 @@ from runtime.content.base import WHITE
 from runtime.content.gaussians import dotted
 from runtime.content.gltf_file import COMPRESSED, WAY_OUT, Array, GltfFile, Read, Table, fractions
 from runtime.content.parts import BLACK, Part, Sampler, Wrap, coded
-from runtime.content.shapes import Shape, flat_normals, placed
+from runtime.content.shapes import Origin, Shape, flat_normals, placed
 from runtime.errors import InputError, one_line
 from runtime.records import F32, F64
 from runtime.support import progress, untrusted_input
@@ -26,10 +26,11 @@ PLACES = {"TRANSLATION": "translation", "ROTATION": "rotation", "SCALE": "scale"
 OWN_PROBLEMS = ("an accessor", "bufferViews[", "a primitive", "a data URI")  # first words of this reader's own messages
 DRACO = "KHR_draco_mesh_compression"
 INSTANCES = "EXT_mesh_gpu_instancing"
+VISIBILITY = "KHR_node_visibility"
 GLOSSY = "KHR_materials_pbrSpecularGlossiness"
 DRAWN = {
     DRACO, GLOSSY, "KHR_materials_unlit", "KHR_materials_emissive_strength", "KHR_texture_transform",
-    "KHR_mesh_quantization", "EXT_texture_webp", "EXT_texture_avif", INSTANCES,
+    "KHR_mesh_quantization", "EXT_texture_webp", "EXT_texture_avif", INSTANCES, VISIBILITY,
 }  # fmt: skip
 UNSEEN = {"KHR_materials_ior", "KHR_materials_specular", "KHR_materials_variants", "KHR_xmp_json_ld"}
 # Extensions that are ignored, even if a file requires them.
@@ -43,18 +44,20 @@ WITHOUT = UNSEEN | {
 class GltfScene:
     """Loads a glTF file's scene as parts and points, and records any features that are not drawn."""
 
-    def __init__(self, path: Path, data: bytes, read: Read) -> None:
+    def __init__(self, path: Path, data: bytes, read: Read, origin: Origin) -> None:
         """Load a scene.
 
         Args:
             path: Scene file.
             data: The file's contents, as glTF or GLB.
             read: Function that reads other files the scene refers to.
+            origin: Origin of the parts and points.
 
         Raises:
             InputError: The file is not glTF 2.0, is damaged, exceeds a limit, or requires an unsupported extension.
         """
-        self.path = path
+        self.path, self._origin = path, origin
+        self._hidden: set[int] = set()  # numbers of the invisible nodes
         self.parts: list[Part] = []
         self.points: list[tuple[F32, F32]] = []  # positions (n, 3) and sRGB colours (n, 3), 0-1
         self.left_out: set[str] = set()  # features that are not drawn
@@ -104,12 +107,14 @@ class GltfScene:
 
     def _read(self) -> None:
         world, file = self._world(), self.file
-        meshes = [(node, matrix) for node, matrix in world.values() if "mesh" in node]
+        meshes = [(node, matrix) for n, (node, matrix) in world.items() if "mesh" in node and n not in self._hidden]
         for number, (node, matrix) in enumerate(meshes):
             progress.tell(f"{self.path.name}: parts", number, len(meshes))
             mesh: Table = file.item("meshes", node["mesh"])
             stands = [self._joints(node, world)] if "skin" in node else self._instanced(node, matrix)
             weights: list[float] = node["weights"] if "weights" in node else mesh.get("weights", [])
+            # A scale of zero hides an object (section 5.25).
+            stands = [matrices for matrices in stands if matrices[..., :3, :3].any()]
             for primitive, matrices in itertools.product(mesh["primitives"], stands):
                 self._add(primitive, weights=weights, matrices=matrices)
         self.left_out |= {"animations"} if file.all("animations") else set()
@@ -118,7 +123,8 @@ class GltfScene:
     def _world(self) -> dict[int, tuple[Table, F64]]:
         """Return the scene's nodes by number, each with its 4x4 scene_from_node matrix.
 
-        Raises InputError if nodes are nested too deeply.
+        Invisible nodes are included, because they may be joints, and recorded in `_hidden`. Raises InputError if nodes
+        are nested too deeply.
         """
         nodes, scenes = self.file.all("nodes"), self.file.all("scenes")
         children = {child for node in nodes for child in node.get("children", [])}
@@ -126,15 +132,18 @@ class GltfScene:
         if scenes:
             roots = self.file.item("scenes", self.file.table.get("scene", 0)).get("nodes", [])
         placed_nodes: dict[int, tuple[Table, F64]] = {}
-        queue = [(root, np.eye(4), 1) for root in reversed(roots)]
+        queue = [(root, np.eye(4), 1, True) for root in reversed(roots)]
         while queue:
-            number, parent, depth = queue.pop()
+            number, parent, depth, is_visible = queue.pop()
             if depth > LIMITS.depth:
                 raise InputError(self.path, "nodes", f"are nested deeper than {LIMITS.depth}")
             if number not in placed_nodes:
                 node = self.file.item("nodes", number)
                 placed_nodes[number] = node, parent @ _local(node)
-                queue += [(child, placed_nodes[number][1], depth + 1) for child in reversed(node.get("children", []))]
+                is_visible &= node.get("extensions", {}).get(VISIBILITY, {}).get("visible", True) is True
+                self._hidden |= set() if is_visible else {number}
+                children_of = reversed(node.get("children", []))
+                queue += [(child, placed_nodes[number][1], depth + 1, is_visible) for child in children_of]
         return placed_nodes
 
     def _joints(self, node: Table, world: dict[int, tuple[Table, F64]]) -> F64:
@@ -184,7 +193,7 @@ class GltfScene:
         assert positions is not None
         if matrices.ndim == 3:
             matrices = self._skinned(matrices, attribute)
-        positions, turned = placed(positions, normals if has_normals else None, matrices)
+        positions, turned = placed(positions, normals if has_normals else None, matrices, origin=self._origin)
         look, use = self._look(primitive.get("material"))
         if mode < TRIANGLES:
             colours = coded(look["colour"] * (np.ones_like(positions) if colours is None else colours[:, :3]))

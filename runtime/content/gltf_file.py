@@ -211,13 +211,22 @@ def _count(accessor: Table) -> int:
 
 
 def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes]:
-    """Return a GLB file's JSON text and binary buffer. Raises InputError if the file is cut off."""
+    """Return a GLB file's JSON text and binary buffer.
+
+    Chunks of other types are skipped (section 4.4.3). Raises InputError if the file is cut off.
+    """
     if int.from_bytes(data[4:8], "little") == 1:
         raise InputError(path, "asset.version", VERSION_1)
     size = int.from_bytes(data[12:16], "little")
     if data[16:20] != b"JSON" or len(data) < 20 + size:
         raise InputError(path, "", "is truncated or malformed: a GLB file must begin with a JSON chunk")
-    return data[20 : 20 + size], data[20 + size + 8 :]
+    text, first = data[20 : 20 + size].rstrip(b"\0 "), 20 + size  # some writers pad with zeros instead of spaces
+    while first + 8 <= len(data):
+        size = int.from_bytes(data[first : first + 4], "little")
+        if data[first + 4 : first + 8] == b"BIN\0":
+            return text, data[first + 8 : first + 8 + size]
+        first += 8 + size
+    return text, b""
 
 
 VERSION_1 = (

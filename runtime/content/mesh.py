@@ -18,7 +18,7 @@ from runtime.content.gltf import GltfScene
 from runtime.content.parts import OUTLINED_MAX, UNCOLOURED, Part, merged
 from runtime.content.placing import GLTF, SceneFile
 from runtime.content.ply import read_header
-from runtime.content.shapes import AT_ONCE, Shape, flat_normals
+from runtime.content.shapes import AT_ONCE, Origin, Shape, flat_normals
 from runtime.content.splat import SplatSource
 from runtime.content.triangles import DrawnPart, TriangleSource
 from runtime.errors import InputError
@@ -35,12 +35,13 @@ OFF_COUNTS = re.compile(rb"^\s*[A-Z4n]*OFF\s+(?:#.*\s+)*(\d{1,18})\s+(\d{1,18})"
 
 @dataclass(frozen=True, slots=True)
 class MeshData:
-    """Triangles or points from a mesh file, in the file's coordinates."""
+    """Triangles or points from a mesh file, in the file's coordinates relative to `origin`."""
 
     parts: tuple[Part, ...]
     points: tuple[tuple[F32, F32], ...]  # positions (n, 3) and colours (n, 3); empty if there are parts
-    low: F64  # (3,) lowest corner of the bounding box
-    high: F64  # (3,) highest corner of the bounding box
+    origin: F64  # (3,) in the file's coordinates; zero unless the content is far from there
+    low: F64  # (3,) lowest corner of the visible content, in the file's coordinates
+    high: F64  # (3,) highest corner
     facing: F64  # (3,) area-weighted mean normal; the length is at most 1, and 0 for a closed surface
     left_out: tuple[str, ...] = ()  # features in the file that are not drawn
 
@@ -56,6 +57,7 @@ def prepare(file: SceneFile) -> Callable[..., ContentSource]:
         log.warning("%s: not drawing %s", file.path, ", ".join(data.left_out))
     info = ContentInfo(file.path.stem, background=file.background, left_out=data.left_out)
     matrix = file.placed(data.low, data.high, facing=data.facing)
+    matrix[:3, 3] += matrix[:3, :3] @ data.origin
     if not data.parts:
         splats = of_points(*map(np.concatenate, zip(*data.points, strict=True)))
         return partial(SplatSource, splats, stack_from_scene=matrix, info=info)
@@ -79,20 +81,21 @@ def load_mesh(path: Path) -> MeshData:
     parts: list[Part] = []
     points: list[tuple[F32, F32]] = []
     left_out: set[str] = set()
+    origin = Origin()
     with np.errstate(all="ignore"):  # `_check` reports coordinates that overflow
         if path.suffix.lower() == ".ply":
             left_out = {name for name, count in read_header(path).counts.items() if count and name in UNREAD}
         elif path.suffix.lower() == ".off" and data.lstrip().startswith(b"COFF"):
             left_out = {"colours"}
         if _is_binary_stl(path, data):
-            parts = [_binary_stl(data)]
+            parts = [_binary_stl(data, origin)]
         elif path.suffix.lower() in GLTF:
-            scene = GltfScene(path, data, folder_reader(path, "uri"))
+            scene = GltfScene(path, data, folder_reader(path, "uri"), origin)
             parts, points, left_out = scene.parts, scene.points, scene.left_out
         else:
             from runtime.content.other_meshes import read_mesh
 
-            parts, points = read_mesh(path, data, folder_reader(path, "texture"))
+            parts, points = read_mesh(path, data, folder_reader(path, "texture"), origin)
     triangles = sum(len(part.shape.triangles) for part in parts)
     untrusted_input.within(triangles, LIMITS.triangles, source=path, field="faces")
     untrusted_input.within(sum(len(place) for place, _ in points), LIMITS.splats, source=path, field="points")
@@ -101,16 +104,21 @@ def load_mesh(path: Path) -> MeshData:
     places = [*(part.shape.positions_m for part in parts), *(place for place, _ in points)]
     _check(path, parts, places, left_out)
     total, area = np.zeros(3), 0.0
+    ends = [end for place, _ in points for end in (place.min(0), place.max(0))]
     for part in parts:
         for first in range(0, len(part.shape.triangles), AT_ONCE):
             corner = part.shape.positions_m[part.shape.triangles[first : first + AT_ONCE]].astype(np.float64)
             normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-            total, area = total + normal.sum(0), area + float(np.linalg.norm(normal, axis=1).sum())
+            areas = np.linalg.norm(normal, axis=1)
+            total, area = total + normal.sum(0), area + float(areas.sum())
+            if areas.any():  # triangles without area are not visible, such as those of an object of scale 0
+                ends += [end(corner[areas > 0], (0, 1)) for end in (np.min, np.max)]
     if parts and not area:
         raise InputError(path, "faces", "all faces have zero area")
-    low, high = (np.asarray(end([end(place, 0) for place in places], 0), np.float64) for end in (np.min, np.max))
+    shift = np.zeros(3) if origin.point is None else origin.point
+    low, high = (np.asarray(end(ends, 0), np.float64) + shift for end in (np.min, np.max))
     said = tuple(untrusted_input.shown(name) for name in sorted(left_out))
-    return MeshData(tuple(parts), tuple(points), low, high, total / (area or 1.0), said)
+    return MeshData(tuple(parts), tuple(points), shift, low, high, total / (area or 1.0), said)
 
 
 def folder_reader(path: Path, field: str) -> Callable[[str], bytes]:
@@ -145,10 +153,11 @@ def _file_of(uri: str, *, source: Path, field: str) -> Path:
         raise InputError(
             source, field, f"{shown} is not a local file; only files in this file's folder or below it are read"
         )
-    name = untrusted_input.path_within_folder(unquote(uri), source=source, field=field)
-    if not (source.parent / name).exists():
+    name = untrusted_input.path_within_folder(unquote(uri).replace("\\", "/"), source=source, field=field)
+    found = untrusted_input.spelled(source.parent, name)
+    if found is None:
         raise InputError(source, field, f"{shown} does not exist")
-    return source.parent / name
+    return found
 
 
 def _check(path: Path, parts: Sequence[Part], places: Sequence[F32], left_out: set[str]) -> None:
@@ -186,10 +195,15 @@ def _is_binary_stl(path: Path, data: bytes) -> bool:
     return path.suffix.lower() == ".stl" and count > 0 and len(data) == STL_HEAD + count * STL_FACET
 
 
-def _binary_stl(data: bytes) -> Part:
+def _binary_stl(data: bytes, origin: Origin) -> Part:
     """Read a binary STL file without trimesh, which needs ten times the memory for the largest files."""
     facets = np.frombuffer(data, [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")], offset=STL_HEAD)
-    corners = np.ascontiguousarray(facets["corners"])
+    corners = np.concatenate(
+        [
+            origin.relative(facets["corners"][first : first + AT_ONCE]).astype(np.float32)
+            for first in range(0, len(facets), AT_ONCE)
+        ]
+    )
     triangles = np.arange(3 * len(facets), dtype=np.int32).reshape(-1, 3)
     normals, uv = np.repeat(flat_normals(corners), 3, axis=0), np.zeros((triangles.size, 2), np.float32)
     return Part(Shape(corners.reshape(-1, 3), normals, uv, triangles), colour=UNCOLOURED)

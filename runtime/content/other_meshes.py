@@ -18,7 +18,8 @@ from runtime.content.base import WHITE, Colour
 from runtime.content.gaussians import dotted
 from runtime.content.gltf_file import Read
 from runtime.content.parts import UNCOLOURED, Part, texture_of
-from runtime.content.shapes import Shape, placed
+from runtime.content.ply import read_header
+from runtime.content.shapes import Origin, Shape, placed
 from runtime.errors import InputError
 from runtime.records import F32, F64, U8
 from runtime.support import progress, untrusted_input
@@ -30,6 +31,7 @@ log = logging.getLogger("phasestack.content")
 BOMS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 # Options that precede a texture's name in an MTL file, such as `-s 1 1 1`, `-blendu off` or `-imfchan r`.
 OPTIONS = re.compile(r"(?:-[a-zA-Z]+(?:\s+(?:on|off|[rgbmlz]|[-+.\d]+(?:[eE][-+]?\d+)?))*\s+)+")
+BEHIND_NUMBERS = re.compile(r"^([ \t]*(?:v|vt|vn|vp|f|l|p)[ \t][^#\n]*)#.*", re.MULTILINE)  # comment in an OBJ file
 DRIVE = re.compile(r"[A-Za-z]:.*/")  # folder on the author's Windows machine, which is stripped from paths
 
 
@@ -70,27 +72,23 @@ class FolderResolver(trimesh.resolvers.FilePathResolver):
     def _named(self, name: str) -> str | None:
         """Return the name of an existing file in the mesh's folder, or None if no file matches.
 
-        The given name may contain MTL options, a Windows path, or letters in the wrong case. Raises
-        InputError if the name is an absolute path or leads out of the folder.
+        The given name may contain MTL options or a Windows path. Raises InputError if the name is an absolute path or
+        leads out of the folder.
         """
         name = DRIVE.sub("", OPTIONS.sub("", name, count=1).strip().replace("\\", "/"))
         within = untrusted_input.path_within_folder(name, source=self._path, field="texture")
-        if (self._path.parent / within).exists():
-            return str(within)
-        folder = self._path.parent
-        for step in within.parts:
-            alike = {other.name.lower(): other for other in folder.iterdir()} if folder.is_dir() else {}
-            folder = alike.get(step.lower(), folder / step)
-        return str(folder.relative_to(self._path.parent)) if folder.exists() else None
+        found = untrusted_input.spelled(self._path.parent, within)
+        return None if found is None else str(found.relative_to(self._path.parent))
 
 
-def read_mesh(path: Path, data: bytes, read: Read) -> tuple[list[Part], list[tuple[F32, F32]]]:
+def read_mesh(path: Path, data: bytes, read: Read, origin: Origin) -> tuple[list[Part], list[tuple[F32, F32]]]:
     """Convert a mesh file's triangles to parts, and its points or lines to coloured points.
 
     Args:
         path: Mesh file.
         data: The file's contents.
         read: Function that reads other files the mesh refers to.
+        origin: Origin of the parts and points.
 
     Returns:
         The parts, and the points as pairs of positions (n, 3) and colours (n, 3).
@@ -104,12 +102,13 @@ def read_mesh(path: Path, data: bytes, read: Read) -> tuple[list[Part], list[tup
     resolver = FolderResolver(
         path, read, has_materials=mark in data.replace(b"\0", b"") if data[:2] in BOMS else mark in data
     )
+    data = _without_comments(path, kind, data)
     file = io.StringIO(_text(data)) if kind == "obj" else io.BytesIO(data)
     try:
         scene = trimesh.load_scene(file, file_type=kind, resolver=resolver, process=False)
         meshes = [(scene.geometry[name], matrix) for matrix, name in map(scene.graph.get, scene.graph.nodes_geometry)]
         has_faces = any(len(getattr(mesh, "faces", ())) for mesh, _ in meshes)
-        wires = _wires(file) if isinstance(file, io.StringIO) and not has_faces else None
+        wires = _wires(file, origin) if isinstance(file, io.StringIO) and not has_faces else None
     except Exception as error:  # trimesh's loaders raise various errors
         if resolver.refused is not None:
             raise resolver.refused from None
@@ -125,23 +124,33 @@ def read_mesh(path: Path, data: bytes, read: Read) -> tuple[list[Part], list[tup
     parts, points = [], []
     for mesh, matrix in meshes:
         if not len(getattr(mesh, "faces", ())):
-            points += _points(mesh)
+            points += _points(mesh, origin)
             continue
         if mesh.visual.kind == "texture" and not resolver.has_materials:  # drop the loader's default grey
             mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=mesh.visual.vertex_attributes.get("color"))
-        parts.append(_part(mesh, matrix, path, pictures))
+        parts.append(_part(mesh, matrix, path, pictures, origin))
     return parts, points if wires is None else [dotted(wires, np.full_like(wires, np.nan))]
 
 
+def _without_comments(path: Path, kind: str, data: bytes) -> bytes:
+    """Remove comments and blank lines between a PLY or STL file's numbers, because trimesh fails at them."""
+    if kind == "stl" and b"\0" not in data[:1024]:
+        return re.sub(rb"#.*", b"", data)
+    if kind == "ply" and (header := read_header(path)).order == "ascii":
+        start = header.starts_at
+        return data[:start] + re.sub(rb"^[ \t\r]*(?:comment.*)?(?:\n|$)", b"", data[start:], flags=re.MULTILINE)
+    return data
+
+
 def _text(data: bytes) -> str:
-    """Decode an OBJ file encoded in UTF-16 or UTF-8.
+    """Decode an OBJ file encoded in UTF-16 or UTF-8, without the comments behind numbers.
 
     Invalid characters are replaced. This is harmless, because only names and comments can contain non-ASCII characters.
     """
-    return data.decode("utf-16" if data[:2] in BOMS else "utf-8", errors="replace")
+    return BEHIND_NUMBERS.sub(r"\1", data.decode("utf-16" if data[:2] in BOMS else "utf-8", errors="replace"))
 
 
-def _wires(file: io.StringIO) -> F32 | None:
+def _wires(file: io.StringIO, origin: Origin) -> F32 | None:
     """Return the ends (n, 2, 3) of the lines in an OBJ file, or None if it contains no lines."""
     places: list[list[str]] = []
     ends: list[tuple[int, int]] = []
@@ -152,7 +161,7 @@ def _wires(file: io.StringIO) -> F32 | None:
             numbers = [int(word.partition("/")[0]) for word in words]
             corners = [number - 1 if number > 0 else len(places) + number for number in numbers]
             ends += itertools.pairwise(corners)
-    return np.array(places, np.float32)[np.array(ends)] if ends else None
+    return origin.relative(np.array(places, np.float64))[np.array(ends)].astype(np.float32) if ends else None
 
 
 def _grey() -> bytes:
@@ -161,15 +170,15 @@ def _grey() -> bytes:
     return file.getvalue()
 
 
-def _points(cloud: Any) -> list[tuple[F32, F32]]:
-    places = np.asarray(getattr(cloud, "vertices", np.empty((0, 3))), np.float32)
+def _points(cloud: Any, origin: Origin) -> list[tuple[F32, F32]]:
+    places = origin.relative(getattr(cloud, "vertices", np.empty((0, 3)))).astype(np.float32)
     if not len(places) or places.shape[1:] != (3,) or not hasattr(cloud, "colors"):
         return []
     colours = np.asarray(cloud.colors)
     return [(places, _unit(colours)[:, :3] if len(colours) == len(places) else np.full_like(places, np.nan))]
 
 
-def _part(mesh: Any, matrix: F64, path: Path, pictures: dict[int, U8]) -> Part:
+def _part(mesh: Any, matrix: F64, path: Path, pictures: dict[int, U8], origin: Origin) -> Part:
     """Convert a trimesh mesh to a part with a material, with vertex or face colours, or in plain grey.
 
     Args:
@@ -177,6 +186,7 @@ def _part(mesh: Any, matrix: F64, path: Path, pictures: dict[int, U8]) -> Part:
         matrix: Matrix (4, 4) from the mesh's frame to the scene's.
         path: Mesh file.
         pictures: Textures converted so far, keyed by the `id` of their material. The dict is updated.
+        origin: Origin of the part.
 
     Raises:
         InputError: A face is not a triangle of existing vertices.
@@ -202,7 +212,7 @@ def _part(mesh: Any, matrix: F64, path: Path, pictures: dict[int, U8]) -> Part:
         picture = None
     else:
         uv = np.column_stack([visual.uv[:, 0], 1.0 - visual.uv[:, 1]]).astype(np.float32)
-    positions, turned = placed(vertices, normals, matrix)
+    positions, turned = placed(vertices, normals, matrix, origin=origin)
     assert turned is not None
     if np.linalg.det(matrix[:3, :3]) < 0:
         faces = faces[:, ::-1]

@@ -93,6 +93,7 @@ def merged(parts: Sequence[Part]) -> list[Part]:
     Merged parts may differ in colour and opacity, which are turned into vertex colours.
     """
     alike: dict[tuple[object, ...], list[list[Part]]] = {}
+    counts: dict[tuple[object, ...], int] = {}  # triangles in the last group
     for part in parts:
         if part.picture is None or part.vertex_colours is not None or (part.colour, part.opacity) != (WHITE, 1.0):
             part = replace(part, vertex_colours=_coloured(part), colour=WHITE, opacity=1.0)
@@ -102,8 +103,10 @@ def merged(parts: Sequence[Part]) -> list[Part]:
             *(part.lit, part.is_linear, part.vertex_colours is None),
         )
         groups = alike.setdefault(look, [[]])
-        if sum(len(other.shape.triangles) for other in (*groups[-1], part)) > OUTLINED_MAX and groups[-1]:
+        counts[look] = counts.get(look, 0) + len(part.shape.triangles)
+        if counts[look] > OUTLINED_MAX and groups[-1]:
             groups.append([])
+            counts[look] = len(part.shape.triangles)
         groups[-1].append(part)
     return [_one(group) for groups in alike.values() for group in groups]
 

@@ -14,6 +14,7 @@ from runtime.records import F32, F64
 
 I32 = NDArray[np.int32]
 
+FAR = 64.0  # positions farther from zero than this many times their extent are centred before they become float32
 AT_ONCE = 1 << 17  # number of vertices or faces processed together, to limit memory use
 
 # Letters needed by the built-in scenes, in 5 x 7 cells with one string per row.
@@ -110,13 +111,33 @@ def flat_normals(corners: ArrayLike) -> F32:
     return normals
 
 
-def placed(positions: ArrayLike, normals: ArrayLike | None, matrices: F64) -> tuple[F32, F32 | None]:
+class Origin:
+    """Point that is subtracted from a file's coordinates before they become float32.
+
+    It is zero unless the file's first positions are so far from zero that float32 would lose their detail.
+    """
+
+    def __init__(self) -> None:
+        self.point: F64 | None = None  # (3,) in the file's coordinates; None before the first positions
+
+    def relative(self, positions: ArrayLike) -> F64:
+        """Return positions (..., 3) relative to the origin, which the first call chooses."""
+        places = np.asarray(positions, np.float64)
+        if self.point is None and places.size:
+            low, high = (end(places.reshape(-1, 3), 0) for end in (np.min, np.max))
+            is_far = np.abs(low + high).max() > 2 * FAR * (high - low).max()
+            self.point = (low + high) / 2 if is_far else np.zeros(3)
+        return places if self.point is None or not self.point.any() else places - self.point
+
+
+def placed(positions: ArrayLike, normals: ArrayLike | None, matrices: F64, *, origin: Origin) -> tuple[F32, F32 | None]:
     """Transform positions and normals by an affine matrix.
 
     Args:
         positions: Vertex positions (v, 3).
         normals: Vertex normals (v, 3), or None.
         matrices: One matrix (4, 4) for all vertices, or one matrix per vertex (v, 4, 4).
+        origin: Origin of the returned positions.
 
     Returns:
         Positions (v, 3) and unit normals (v, 3). The normals are None if none are given.
@@ -128,7 +149,7 @@ def placed(positions: ArrayLike, normals: ArrayLike | None, matrices: F64) -> tu
         rows = slice(first, first + AT_ONCE)
         matrix = matrices[rows] if matrices.ndim == 3 else matrices
         linear = matrix[..., :3, :3]
-        moved[rows] = _times(linear, positions[rows]) + matrix[..., :3, 3]
+        moved[rows] = origin.relative(_times(linear, positions[rows]) + matrix[..., :3, 3])
         if normals is not None and turned is not None:
             # Joints are assumed to scale uniformly, whereas nodes may have any linear transformation.
             turn = linear if matrices.ndim == 3 else np.linalg.pinv(linear).T

@@ -10,6 +10,7 @@ import errno
 import json
 import os
 import stat
+import unicodedata
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -31,7 +32,7 @@ class Limits:
     texture_pixels: int = 134_217_728  # total number of pixels in all of a scene's pictures
     triangles: int = 2_000_000  # number of triangles in a scene, summed over all instances
     splats: int = 3_000_000
-    instances: int = 2000  # number of placed meshes in a glTF scene
+    instances: int = 10_000  # number of placed meshes in a glTF scene
     json_values: int = 4_000_000  # number of values in one JSON text; this many take a gigabyte in Python
     depth: int = 64  # nesting depth in JSON or in a glTF scene
     load_s: float = 120.0  # time for loading one piece of content
@@ -87,6 +88,24 @@ def path_within_folder(path: str, *, source: str | Path, field: str) -> Path:
     raise InputError(
         source, field, f"{shown(path, most=200)} {problem}; only files in this folder or below it are read"
     )
+
+
+def spelled(folder: Path, name: Path) -> Path | None:
+    """Return the existing file in a folder with a given relative name, or None.
+
+    If there is none, letter case and the Unicode form of letters such as é are ignored, as on the systems where names
+    that differ in them alone are written.
+    """
+    if (folder / name).exists():
+        return folder / name
+    for step in name.parts:
+        alike = {_folded(other.name): other for other in folder.iterdir()} if folder.is_dir() else {}
+        folder = alike.get(_folded(step), folder / step)
+    return folder if folder.exists() else None
+
+
+def _folded(name: str) -> str:
+    return unicodedata.normalize("NFC", name).casefold()
 
 
 def is_there(path: str | Path, *, folder: bool = False) -> bool:

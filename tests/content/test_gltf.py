@@ -188,6 +188,85 @@ def test_a_skin_has_the_pose_of_its_nodes(tmp_path: Path) -> None:
     assert data.low[0] == -1 and data.high[0] == pytest.approx(1 - 1 + 4)
 
 
+@pytest.mark.parametrize(
+    "hidden",
+    [
+        {"scale": [0, 0, 0]},
+        {"extensions": {"KHR_node_visibility": {"visible": False}}},
+    ],
+)
+def test_hidden_objects_do_not_count_in_the_fit(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, hidden: dict[str, Any]
+) -> None:
+    """A hidden node hides its children. `visible` alone changes nothing."""
+    b = Buffer()
+    nodes = [
+        {"mesh": 0, "extensions": {"KHR_node_visibility": {"visible": True}}},
+        {"children": [2], "translation": [100, 0, 0], **hidden},
+        {"mesh": 0},
+    ]
+    tables = {"nodes": nodes, "scenes": [{"nodes": [0, 1]}], "extensionsUsed": ["KHR_node_visibility"]}
+    data = load_mesh(b.write(tmp_path / "a.gltf", square(b), materials=[{}], **tables))
+    assert len(data.parts) == 1 and data.high.tolist() == [1, 1, 0] and data.left_out == ()
+
+
+def test_triangles_without_area_do_not_count_in_the_fit(tmp_path: Path) -> None:
+    """Such as those of a skin whose joints have a scale of 0."""
+    b = Buffer()
+    primitive = square(b)
+    dot = primitive | {"attributes": {"POSITION": b.add([[50.0, 0, 0]] * 4)}}
+    meshes = [{"primitives": [primitive, dot]}]
+    data = load_mesh(b.write(tmp_path / "a.gltf", primitive, meshes=meshes, materials=[{}]))
+    assert data.high.tolist() == [1, 1, 0]
+
+
+@pytest.mark.parametrize("at", [1e7, 1e9])
+def test_nodes_far_from_the_origin_are_centred_before_they_are_float32(tmp_path: Path, at: float) -> None:
+    b = Buffer()
+    nodes = [{"children": [1, 2], "translation": [at, 0, 0]}, {"mesh": 0}, {"mesh": 0, "translation": [3, 0, 0]}]
+    data = load_mesh(b.write(tmp_path / "a.gltf", square(b), nodes=nodes, materials=[{}]))
+    first, second = (part.shape.positions_m for part in data.parts)
+    assert (second - first)[:, 0] == pytest.approx(3, abs=1e-5) and np.ptp(first, axis=0).tolist() == [2, 2, 0]
+    assert data.low[0] == at - 1 and data.high[0] == at + 4
+
+
+def glb(*chunks: tuple[bytes, bytes]) -> bytes:
+    body = b"".join(len(data).to_bytes(4, "little") + kind + data for kind, data in chunks)
+    return b"glTF" + (2).to_bytes(4, "little") + (12 + len(body)).to_bytes(4, "little") + body
+
+
+@pytest.mark.parametrize("more", [(), ((b"XTRA", b"1234"),)])
+def test_a_glb_may_be_padded_with_zeros_and_have_other_chunks(
+    tmp_path: Path, more: tuple[tuple[bytes, bytes], ...]
+) -> None:
+    b = Buffer()
+    table = b.table(square(b), materials=[{}])
+    table["buffers"] = [{"byteLength": len(b.data)}]
+    text = json.dumps(table).encode()
+    (tmp_path / "a.glb").write_bytes(glb((b"JSON", text + b"\0" * 5), *more, (b"BIN\0", b.data + b"\0\0")))
+    assert load_mesh(tmp_path / "a.glb").high.tolist() == [1, 1, 0]
+
+
+def test_a_glb_without_a_binary_chunk_is_said_to_be_incomplete(tmp_path: Path) -> None:
+    b = Buffer()
+    table = b.table(square(b), materials=[{}])
+    table["buffers"] = [{"byteLength": len(b.data)}]
+    (tmp_path / "a.glb").write_bytes(glb((b"JSON", json.dumps(table).encode()), (b"XTRA", b.data)))
+    with pytest.raises(InputError, match=r"buffers\[0\]\.uri: is missing"):
+        load_mesh(tmp_path / "a.glb")
+
+
+@pytest.mark.parametrize("uri", ["Textures/WOOD é.png", "textures\\wood e\u0301.png", "textures/wood%20%C3%A9.png"])
+def test_a_texture_is_found_in_another_case_or_unicode_form(tmp_path: Path, uri: str) -> None:
+    b = Buffer()
+    (tmp_path / "textures").mkdir()
+    Image.fromarray(HALVES).save(tmp_path / "textures" / "wood é.png")
+    look = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}]
+    tables = {"images": [{"uri": uri}], "textures": [{"source": 0}], "materials": look}
+    (part,) = load_mesh(b.write(tmp_path / "a.gltf", square(b) | {"material": 0}, **tables)).parts
+    assert part.picture is not None and part.picture.shape[:2] == HALVES.shape[:2]
+
+
 def test_a_node_stands_as_often_as_its_instances_say(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """EXT_mesh_gpu_instancing."""
     b = Buffer()

@@ -375,3 +375,84 @@ def test_an_obj_in_another_encoding_and_a_texture_with_spaces_are_read(tmp_path:
     (part,) = load_mesh(tmp_path / "a.obj").parts
     assert part.picture is not None
     assert part.picture[0, 0].tolist() == [255, 0, 0, 255]
+
+
+FAR = np.array([4.5e6, 5.4e6, 300.0])  # an offset as in UTM coordinates
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".off", ".ply"])
+def test_a_mesh_far_from_its_origin_looks_as_one_there(
+    tmp_path: Path, context: Any, stack: PanelStack, suffix: str
+) -> None:
+    """float32 has a spacing of 0.5 at these coordinates, and the ball a radius of 1."""
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    view = panel_view(EYE, stack.panel(1))
+    pictures = []
+    for name, offset in (("near", 0 * FAR), ("far", FAR)):
+        vertices = "".join(("v " if suffix == ".obj" else "") + f"{x} {y} {z}\n" for x, y, z in ball.vertices + offset)
+        first, count = ("f", 1) if suffix == ".obj" else ("3", 0)
+        faces = "".join(f"{first} {a} {b} {c}\n" for a, b, c in ball.faces + count)
+        head = {
+            ".obj": "",
+            ".off": f"OFF\n{len(ball.vertices)} {len(ball.faces)} 0\n",
+            ".ply": f"ply\nformat ascii 1.0\nelement vertex {len(ball.vertices)}\n"
+            + "".join(f"property double {axis}\n" for axis in "xyz")
+            + f"element face {len(ball.faces)}\nproperty list uchar int vertex_indices\nend_header\n",
+        }[suffix]
+        path = tmp_path / f"{name}{suffix}"
+        path.write_text(head + vertices + faces)
+        source = source_of(path, context, stack, axes="+z +x")
+        pictures.append(source.render(view, time_ns=0).astype(int))
+    assert (pictures[0][..., 3] == 255).sum() > 1000
+    assert np.abs(pictures[0] - pictures[1]).max() <= 2
+
+
+def test_points_far_from_their_origin_look_as_those_there(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    points = trimesh.creation.icosphere(subdivisions=3).vertices
+    pictures = []
+    for name, offset in (("near", 0 * FAR), ("far", FAR)):
+        path = tmp_path / f"{name}.ply"
+        head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n"
+        path.write_bytes(
+            (head + "".join(f"property double {axis}\n" for axis in "xyz") + "end_header\n").encode()
+            + (points + offset).astype("<f8").tobytes()
+        )
+        source = source_of(path, context, stack, axes="+z +x")
+        pictures.append(source.render(panel_view(EYE, stack.panel(1)), time_ns=0).astype(int))
+    assert (pictures[0][..., 3] > 128).sum() > 1000
+    assert np.abs(pictures[0] - pictures[1]).max() <= 2
+
+
+def test_a_binary_stl_far_from_its_origin_is_centred(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    """Its float32 corners are exact; what is drawn with must not round them again."""
+    box = trimesh.creation.box((2.0, 1.0, 1.0))
+    box.apply_translation([2.0**23, 0, 0])
+    box.export(tmp_path / "far.stl")
+    source = source_of(tmp_path / "far.stl", context, stack)
+    (part,) = source.parts
+    assert np.ptp(part.positions, axis=0).tolist() == [2.0, 1.0, 1.0]
+    assert np.abs(part.positions).max() <= 1.0 and np.abs(source.stack_from_parts[0][:3, 3]).max() < 1.0
+
+
+COMMENTED = {
+    "a.obj": "g Name # one\nv 0 0 0 # end\n   # indented\nv 1 0 0\t# tab\n\nv 0 1 0\n\nf 1 2 3 # face\n# last",
+    "a.ply": "ply\nformat ascii 1.0\ncomment one\nelement vertex 3\n"
+    + "".join(f"property float {axis}\n" for axis in "xyz")
+    + "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    + "\n0 0 0\ncomment two\n\n1 0 0\r\n\n0 1 0\n   \n3 0 1 2\n",
+    "a.stl": "# one\nsolid x # two\nfacet normal 0 0 1 # three\n outer loop\n vertex 0 0 0 # four\n"
+    + " vertex 1 0 0 # five\n vertex 0 1 0\n endloop\nendfacet\nendsolid x\n",
+}
+
+
+@pytest.mark.parametrize("name", COMMENTED)
+def test_comments_and_blank_lines_between_numbers_are_skipped(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text(COMMENTED[name])
+    data = load_mesh(tmp_path / name)
+    assert data.low.tolist() == [0, 0, 0] and data.high.tolist() == [1, 1, 0]
+
+
+def test_a_number_sign_in_a_material_s_name_is_no_comment(tmp_path: Path) -> None:
+    (tmp_path / "a.mtl").write_text("newmtl red #1\nKd 1 0 0\n")
+    (tmp_path / "a.obj").write_text("mtllib a.mtl\n" + TRIANGLE + "usemtl red #1\nf 1 2 3\n")
+    assert load_mesh(tmp_path / "a.obj").parts[0].colour == (1.0, 0.0, 0.0)
