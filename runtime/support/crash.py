@@ -25,14 +25,26 @@ def written(error: BaseException) -> str:
 
     If no file can be written, the line says so. Never raises an exception.
     """
+    summary = one_line(f"{type(error).__name__}: {error}" if str(error) else type(error).__name__)
+    return f"unexpected error: {summary}; {report_of('', ''.join(traceback.format_exception(error)))}"
+
+
+def report_of(summary: str, trace: str) -> str:
+    """Write a report to a file, and return the part of a message that names the file.
+
+    If no file can be written, the message says so. Never raises an exception.
+
+    Args:
+        summary: What has happened, such as the end of another process. Empty if the trace says it.
+        trace: The stack, or the stacks of all threads.
+    """
     from runtime.support.version import version
 
-    summary = one_line(f"{type(error).__name__}: {error}" if str(error) else type(error).__name__)
     now = datetime.now(UTC)
     text = (
         f"phasestack {version()}, Python {platform.python_version()}, {platform.platform()}\n"
         f"{now.isoformat(timespec='seconds')}, process {os.getpid()}\n"
-        f"arguments: {sys.argv[1:]!r}\n\n" + "".join(traceback.format_exception(error))
+        f"arguments: {sys.argv[1:]!r}\n\n" + (f"{summary}\n" if summary else "") + trace
     )
     for folder in (state_folder(), Path(tempfile.gettempdir())):
         with contextlib.suppress(OSError):
@@ -48,8 +60,8 @@ def written(error: BaseException) -> str:
             with contextlib.suppress(OSError):  # some files may belong to another user
                 for old in sorted(folder.glob(f"{STEM}*.log"))[:-KEPT]:
                     old.unlink()
-            return f"unexpected error: {summary}; please report this bug with the file {path}"
-    return f"unexpected error: {summary}; the crash report could not be written"
+            return f"please report this bug with the file {path}"
+    return "the crash report could not be written"
 
 
 def watch_threads() -> None:
