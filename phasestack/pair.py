@@ -1,4 +1,4 @@
-"""Solve pairs of pictures for a stack of panels, and measure the quality of any layers."""
+"""Solve pictures for a stack of panels, and measure the quality of any layers."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import webbrowser
 from collections.abc import Iterable, Iterator, Sequence, Sized
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
+from itertools import combinations
 from pathlib import Path
 from threading import Lock
 from typing import Any, TypedDict, Unpack
@@ -24,6 +25,7 @@ from phasestack.stack import checked_stack
 from runtime.errors import InputError, ModelFailure
 from runtime.evaluation.displayed import SIGMAS_MM, Picture
 from runtime.evaluation.solved import PairQuality, SolvedPair
+from runtime.model.job import VIEWS_MOST
 from runtime.model.predictor import Predictor, load_predictor
 from runtime.model.still import solve_still
 from runtime.optics.cameras import as_cameras, doubts, looking_at_origin
@@ -37,10 +39,12 @@ from runtime.support.progress import ShownProgress
 from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG, SEPARATION_MIN_M, refusal
 
 EVERY_LEAST = 20  # minimum number of pixels to sample along a picture's shorter side
+LEAST_APART_M = 0.0005  # minimum distance between two views' eyes if there are more than two
 SAME_PLACE_M = 0.001  # maximum distance between an eye and its camera
 _one_at_a_time = Lock()  # a loaded model reuses its buffers
 
 Eyes = Sequence[Sequence[float]] | Sequence[F64] | F64
+Pictures = Sequence[ArrayLike] | ArrayLike
 Cameras = Sequence[Sequence[Sequence[float]]] | Sequence[F64] | F64
 
 
@@ -70,7 +74,7 @@ class Measuring(TypedDict, total=False):
 
 
 class Result:
-    """The layers computed for a pair of pictures.
+    """The layers computed for pictures, one for each eye.
 
     The result can also show what each eye sees of the layers, measure the quality, and save everything to files.
     """
@@ -100,8 +104,13 @@ class Result:
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
-        """Warnings that the eyes will see ghosts, because the pictures have too much disparity for the stack."""
+        """Warnings that the eyes will see ghosts, because the pictures have too much disparity for the stack.
+
+        Only two pictures are checked.
+        """
         asked = self._asked
+        if len(asked.pictures) != 2:
+            return ()
         return tuple(
             disparity_doubts(
                 asked.pictures, asked.eyes_m, asked.stack, fov_deg=asked.fov_deg, parallel=not asked.is_resampled
@@ -126,7 +135,7 @@ class Result:
 
     @property
     def seen(self) -> U8:
-        """The eyes' simulated views through the layers, as a (2, h, w, 3) array with the left eye first."""
+        """The eyes' simulated views through the layers, as a (V, h, w, 3) array in the order of the pictures."""
         return np.stack(self._pair.seen)
 
     @cached_property
@@ -167,8 +176,8 @@ class Result:
 
 
 def solve(
-    left: ArrayLike,
-    right: ArrayLike,
+    left: Pictures,
+    right: ArrayLike | None = None,
     *,
     stack: PanelStack,
     eyes_m: Eyes | None = None,
@@ -179,17 +188,20 @@ def solve(
 ) -> Result:
     """Compute the layers that show each eye its picture.
 
-    A warning is issued for each implausible argument.
+    `solve(left, right, ...)` serves one viewer, and `solve(pictures, ...)` any number of views: the first two are the
+    first viewer's left and right eye, the next two the second viewer's. A stack shows about as many different pictures
+    as it has panels. A warning is issued for each implausible argument.
 
     Args:
         left: Picture for the left eye: an array (h, w, 3 or 4) of uint8 or of floats in 0..1, or a Pillow image. It
-            must be taken by a pinhole camera at the eye that looks at the stack's origin without roll.
+            must be taken by a pinhole camera at the eye that looks at the stack's origin without roll. If `right` is
+            omitted, a sequence of such pictures, all of the same size.
         right: Picture for the right eye, of the same size.
         stack: Panel geometry.
-        eyes_m: Left and right eye positions in metres, in the `stack` frame (+x out of the screen, +y to the viewer's
-            right, +z up). Required unless `cameras` is given.
+        eyes_m: Positions (V, 3) of the V pictures' eyes in metres, in the `stack` frame (+x out of the screen, +y to
+            the viewer's right, +z up). Required unless `cameras` is given.
         fov_deg: The pictures' horizontal field of view, in degrees.
-        cameras: Two 3x4 matrices for pictures taken by other pinhole cameras, such as parallel or shifted ones. Each
+        cameras: 3x4 matrices for pictures taken by other pinhole cameras, such as parallel or shifted ones. Each
             matrix maps homogeneous metres in the `stack` frame to homogeneous pixels, with +u right, +v down and pixel
             centres at half-integers. It is K·[R | t] with OpenCV's axes; add half a pixel to the principal point if K
             assumes pixel centres at integers. The cameras replace `eyes_m` and `fov_deg`: the pictures are resampled to
@@ -200,7 +212,7 @@ def solve(
     Raises:
         ValueError: An argument is invalid. The message begins with the argument's name.
     """
-    pair = _checked((left, right), stack=stack, eyes_m=eyes_m, fov_deg=fov_deg, cameras=cameras)
+    pair = _checked(left, right, stack=stack, eyes_m=eyes_m, fov_deg=fov_deg, cameras=cameras)
     eye_sigma_mm = _number("eye_sigma_mm", eye_sigma_mm, 0.0, 1000.0, "mm")
     with _one_at_a_time:
         try:
@@ -221,7 +233,7 @@ def solve(
             raise ValueError(str(error) if error.source == "model" else f"model: {error}") from None
         except ModelFailure as error:
             raise ValueError(f"eyes_m: {error}") from None
-    return Result(layers, pair, model=predictor.name, eye_sigma_mm=eye_sigma_mm, total_ms=total_ms)
+    return Result(layers, pair, model=predictor.name_with(len(codes)), eye_sigma_mm=eye_sigma_mm, total_ms=total_ms)
 
 
 def solve_each(
@@ -266,8 +278,8 @@ def solve_each(
 
 def evaluate(
     layers: ArrayLike,
-    left: ArrayLike,
-    right: ArrayLike,
+    left: Pictures,
+    right: ArrayLike | None = None,
     *,
     stack: PanelStack,
     eyes_m: Eyes | None = None,
@@ -281,7 +293,7 @@ def evaluate(
         layers: Array (panels, h, w, 3 or 4) from rear to front, at the stack's resolution, of uint8 or of floats in
             0..1. A panel value v rotates the polarization by v·90 degrees, and an eye sees sin² of the sum of the
             angles along a ray. Floats are rounded to a panel's 8 bits.
-        left: Picture that the left eye should see, as in `solve`.
+        left: Picture that the left eye should see or, if `right` is omitted, all eyes' pictures, as in `solve`.
         right: Picture that the right eye should see, as in `solve`.
         stack: Panel geometry.
         eyes_m: Eye positions, as in `solve`.
@@ -294,7 +306,7 @@ def evaluate(
     Raises:
         ValueError: An argument is invalid. The message begins with the argument's name.
     """
-    pair = _checked((left, right), stack=stack, eyes_m=eyes_m, fov_deg=fov_deg, cameras=cameras)
+    pair = _checked(left, right, stack=stack, eyes_m=eyes_m, fov_deg=fov_deg, cameras=cameras)
     given = as_array("layers", layers)
     wanted = (pair.stack.count, pair.stack.height_px, pair.stack.width_px)
     if given.ndim != 4 or given.shape[:3] != wanted or given.shape[3] not in (3, 4):
@@ -384,8 +396,24 @@ def project(
     return np.asarray(seen[..., :2] / depth)
 
 
+def _named(left: Any, right: Any) -> dict[str, Any]:
+    """Return the given pictures by the names to use in error messages.
+
+    Raises:
+        ValueError: The pictures are not a sequence, or there are too few or too many.
+    """
+    if right is not None:
+        return {"left": left, "right": right}
+    if not isinstance(left, Sequence) and getattr(left, "ndim", 0) != 4:
+        raise ValueError("right: is required, unless the first argument is a sequence of pictures")
+    if isinstance(left, str) or not 1 <= len(left) <= VIEWS_MOST:
+        raise ValueError(f"pictures: must be a sequence of 1 to {VIEWS_MOST} pictures")
+    return {f"pictures[{n}]": picture for n, picture in enumerate(left)}
+
+
 def _checked(
-    given: tuple[ArrayLike, ArrayLike],
+    left: Any,
+    right: Any,
     *,
     stack: PanelStack,
     eyes_m: Eyes | None,
@@ -397,11 +425,14 @@ def _checked(
     Raises:
         ValueError: An argument is invalid, or an eye sees no part of the display. The message names the argument.
     """
-    pictures = [as_picture(name, picture) for name, picture in zip(("left", "right"), given, strict=True)]
-    if pictures[0].shape != pictures[1].shape:
-        raise ValueError(
-            f"right: must have the same shape as left ({pictures[0].shape}), but has shape {pictures[1].shape}"
-        )
+    given = _named(left, right)
+    first, *_ = given
+    pictures = [as_picture(name, picture) for name, picture in given.items()]
+    for name, picture in zip(given, pictures, strict=True):
+        if picture.shape != pictures[0].shape:
+            raise ValueError(
+                f"{name}: must have the same shape as {first} ({pictures[0].shape}), but has shape {picture.shape}"
+            )
     stack = checked_stack(stack)
     fov_deg = _number("fov_deg", fov_deg, *FOV_RANGE_DEG, "degrees")
     if cameras is None:
@@ -409,12 +440,12 @@ def _checked(
             raise ValueError(
                 "eyes_m: is required without cameras; pass the positions of the left and right eyes in metres"
             )
-        eyes = _eyes(eyes_m, stack)
+        eyes = _eyes(eyes_m, stack, count=len(pictures))
     else:
         try:
-            matrices, places_m = as_cameras(cameras)
-            eyes = _eyes(places_m, stack)
-            if eyes_m is not None and np.abs(_eyes(eyes_m, stack) - eyes).max() > SAME_PLACE_M:
+            matrices, places_m = as_cameras(cameras, count=len(pictures))
+            eyes = _eyes(places_m, stack, count=len(pictures))
+            if eyes_m is not None and np.abs(_eyes(eyes_m, stack, count=len(pictures)) - eyes).max() > SAME_PLACE_M:
                 raise ValueError(f"are at {np.round(eyes, 4).tolist()}, which contradicts eyes_m; omit eyes_m")
             pictures, fov_deg = looking_at_origin(pictures, matrices, eyes, stack)
         except ValueError as error:
@@ -450,26 +481,28 @@ def _loaded(model: str, stack: PanelStack) -> Predictor:
     return load_predictor(model, stack)
 
 
-def _eyes(eyes_m: Any, stack: PanelStack) -> F64:
-    """Return the eyes as a (2, 3) array.
+def _eyes(eyes_m: Any, stack: PanelStack, *, count: int) -> F64:
+    """Return the eyes as a (count, 3) array.
 
     Raises:
-        ValueError: The eyes are not two points with three finite numbers each, are too far away, are not in front of
-            the panels, or are less than 5 mm apart.
+        ValueError: The eyes are not `count` points with three finite numbers each, are too far away, are not in front
+            of the panels, or are too close together.
     """
+    points = "two points" if count == 2 else f"{count} points, one for each picture,"
     try:
         eyes = np.asarray(eyes_m, np.float64)
     except (TypeError, ValueError):
-        raise ValueError("eyes_m: must be two points of three numbers in metres") from None
-    if eyes.shape != (2, 3) or not np.isfinite(eyes).all():
-        raise ValueError(f"eyes_m: must be two points of three finite numbers in metres; the shape is {eyes.shape}")
+        raise ValueError(f"eyes_m: must be {points} of three numbers in metres") from None
+    if eyes.shape != (count, 3) or not np.isfinite(eyes).all():
+        raise ValueError(f"eyes_m: must be {points} of three finite numbers in metres; the shape is {eyes.shape}")
     if np.abs(eyes).max() > EYE_MOST_M:
         raise ValueError(f"eyes_m: {refusal(float(np.abs(eyes).max()), -EYE_MOST_M, EYE_MOST_M, 'm')}")
     if eyes[:, 0].min() <= stack.x_m[-1]:
         raise ValueError(
             f"eyes_m: x = {eyes[:, 0].min():g} m is not in front of the panels; x must exceed {stack.x_m[-1]:g} m"
         )
-    apart_m = float(np.linalg.norm(eyes[0] - eyes[1]))
-    if apart_m < SEPARATION_MIN_M:
-        raise ValueError(f"eyes_m: the eyes are {apart_m * 1e3:g} mm apart, but the minimum is 5 mm")
+    apart_m = min((float(np.linalg.norm(a - b)) for a, b in combinations(eyes, 2)), default=np.inf)
+    least_m = SEPARATION_MIN_M if count == 2 else LEAST_APART_M
+    if apart_m < least_m:
+        raise ValueError(f"eyes_m: the eyes are {apart_m * 1e3:g} mm apart, but the minimum is {least_m * 1e3:g} mm")
     return eyes

@@ -20,6 +20,7 @@ class Stack(PanelStack):
         width_px: Number of pixel columns on each panel.
         height_px: Number of pixel rows on each panel.
         tilt: The panels' deviation from parallel planes, as measured by a calibration.
+        colour: For each panel, True if it has colour filters. Empty if all panels have.
     """
 
     __slots__ = ()
@@ -32,6 +33,7 @@ class Stack(PanelStack):
         width_px: int,
         height_px: int,
         tilt: Tilt | None = None,
+        colour: Sequence[bool] = (),
     ) -> None:
         """Validate the geometry. Raises ValueError if an argument is invalid, naming the argument."""
         given = {"width_m": width_m, "height_m": height_m, "width_px": width_px, "height_px": height_px}
@@ -40,10 +42,18 @@ class Stack(PanelStack):
         except (TypeError, ValueError):
             raise ValueError(f"x_m: must list the panels' positions, such as (-0.03, 0.0, 0.03), not {x_m!r}") from None
         try:
-            checked = validated(StackGeometry, {**given, "x_m": places}, source="")
+            checked = validated(StackGeometry, {**given, "x_m": places, "colour": tuple(colour)}, source="")
         except InputError as error:
             raise ValueError(str(error)) from None
-        super().__init__(checked.width_m, checked.height_m, checked.x_m, checked.width_px, checked.height_px, tilt)
+        super().__init__(
+            checked.width_m,
+            checked.height_m,
+            checked.x_m,
+            checked.width_px,
+            checked.height_px,
+            tilt,
+            checked.stack().colour,
+        )
 
 
 def checked_stack(stack: object) -> PanelStack:

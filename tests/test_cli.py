@@ -181,3 +181,16 @@ def test_run_shows_a_file_in_the_layout_that_it_is_given(pair: Path, tmp_path: P
         assert done.returncode == 0, done.stderr
         seen = [read_image(tmp_path / layout / f"wanted-{side}.png").astype(int) for side in ("left", "right")]
         assert (abs(seen[0] - seen[1]).mean() > 20) == differ
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        ((), "solve: --left: is required without --case"),
+        (("--left", "left.png"), "solve: --panels: is required without --case"),
+        (("--case", "case.json", "--left", "left.png"), "solve: --left: is part of the case file"),
+        (("--case", "missing.json"), "missing.json"),
+    ],
+)
+def test_pictures_come_from_options_or_from_a_case_file(arguments: tuple[str, ...], told: str, tmp_path: Path) -> None:
+    assert told in refusal("solve", "--out", str(tmp_path / "out"), *arguments)

@@ -22,6 +22,8 @@ from runtime.evaluation import solved
 from runtime.optics.disparity import _compared, disparity_doubts
 from runtime.optics.stack import PanelStack
 from runtime.report.pairs import PairPainter, read_pairs
+from runtime.support.artifacts import write_png
+from tests.model.scenes import card_scene
 from tests.test_cli import pair_in, solve_arguments
 from tests.test_extras import BLOCKED, of_extras
 
@@ -340,6 +342,68 @@ def test_many_pairs_are_solved_in_turn() -> None:
     assert len(results) == 3 and np.array_equal(results[2].layers, alone.layers)
     with pytest.raises(ValueError, match=r"pairs\[1\]: eyes_m"):
         list(phasestack.solve_each([(picture(), picture(3), EYES), (picture(), picture(3), ())], stack=STACK))
+
+
+FOUR_EYES = ((0.6, -0.24, 0.0), (0.6, -0.18, 0.0), (0.6, 0.18, 0.0), (0.6, 0.24, 0.0))
+FOUR_PANELS = phasestack.Stack(
+    width_m=0.5184, height_m=0.2916, x_m=(-0.09, -0.03, 0.03, 0.09), width_px=320, height_px=180
+)
+
+
+def card_pictures() -> list[np.ndarray]:
+    return [card_scene(np.array(eye), width_px=320, height_px=180) for eye in FOUR_EYES]
+
+
+def test_four_eyes_see_four_pictures(tmp_path: Path) -> None:
+    pictures = card_pictures()
+    result = phasestack.solve(pictures, eyes_m=FOUR_EYES, stack=FOUR_PANELS)
+    assert result.layers.shape == (4, 180, 320, 3) and result.seen.shape == (4, 180, 320, 3)
+    measured = result.measure(sigmas_mm=(0,), every=2)
+    assert min(measured.eye_psnr_db) > 18
+    swapped = phasestack.evaluate(
+        result.layers, pictures[2:] + pictures[:2], eyes_m=FOUR_EYES, stack=FOUR_PANELS, sigmas_mm=(0,), every=2
+    )
+    assert measured.light_db["0"] > swapped.light_db["0"] + 5
+    result.save(tmp_path / "out")
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert {"seen-left.png", "seen-right.png", "seen-left-2.png", "seen-right-2.png", "wanted-right-2.png"} <= names
+
+
+def test_a_case_file_with_four_eyes_is_what_python_solves(tmp_path: Path) -> None:
+    for n, picture_ in enumerate(card_pictures()):
+        write_png(tmp_path / f"{n}.png", picture_)
+    panels = {"width_m": 0.5184, "height_m": 0.2916, "x_m": FOUR_PANELS.x_m}
+    case = {"panels": panels, "eyes": FOUR_EYES, "images": [f"{n}.png" for n in range(4)], "fov": 40.0}
+    (tmp_path / "case.json").write_text(json.dumps(case))
+    app(["solve", "--case", str(tmp_path / "case.json"), "--out", str(tmp_path / "out")], standalone_mode=False)
+    layers = phasestack.solve(card_pictures(), eyes_m=FOUR_EYES, stack=FOUR_PANELS).layers
+    written = [cv2.imread(str(tmp_path / "out" / f"layer-{n}.png"))[..., ::-1] for n in range(4)]
+    assert np.array_equal(np.stack(written), layers)
+    told = json.loads((tmp_path / "out" / "solve.json").read_text())
+    assert len(told["eye_psnr_db"]) == 4
+
+
+def test_a_panel_without_filters_has_one_value_for_all_colours() -> None:
+    stack = phasestack.Stack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 320, 180, colour=(True, True, False))
+    pictures = [card_scene(np.array(eye), width_px=320, height_px=180) for eye in EYES]
+    layers = phasestack.solve(*pictures, eyes_m=EYES, stack=stack).layers
+    assert (np.ptp(layers[2], axis=-1) == 0).all() and np.ptp(layers[0], axis=-1).max() > 50
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"left": [picture()] * 3}, "eyes_m: must be 3 points"),
+        ({"left": [picture(), picture()[:90]]}, r"pictures\[1\]: must have the same shape as pictures\[0\]"),
+        ({"left": []}, "pictures: must be a sequence of 1 to 8"),
+        ({"left": picture()}, "right: is required"),
+        ({"left": [picture()] * 3, "eyes_m": (*EYES, EYES[0])}, "eyes_m: the eyes are 0 mm apart"),
+    ],
+)
+def test_views_that_do_not_fit_are_refused(given: dict[str, Any], told: str) -> None:
+    arguments: dict[str, Any] = {"eyes_m": EYES, "stack": STACK, **given}
+    with pytest.raises(ValueError, match=told):
+        phasestack.solve(arguments.pop("left"), **arguments)
 
 
 def rectified(shift_px: int, levels: Sequence[int] = (30, 90, 160, 230)) -> tuple[np.ndarray, ...]:

@@ -1,4 +1,4 @@
-"""`phasestack solve`: compute the layers for one still stereo pair."""
+"""`phasestack solve`: compute the layers for still pictures."""
 
 from __future__ import annotations
 
@@ -12,11 +12,21 @@ from runtime.support.ranges import FOV_RANGE_DEG
 
 
 def solve(
-    left: Annotated[
-        Path, typer.Option(help="picture taken by a pinhole camera at the left eye, aimed at the stack's origin")
-    ],
-    panels: Annotated[Path, typer.Option(help="TOML or JSON file with the stack geometry (width_m, height_m and x_m)")],
     out: Annotated[Path, typer.Option(help="folder to write the layers to")],
+    left: Annotated[
+        Path | None,
+        typer.Option(help="picture taken by a pinhole camera at the left eye, aimed at the stack's origin"),
+    ] = None,
+    panels: Annotated[
+        Path | None, typer.Option(help="TOML or JSON file with the stack geometry (width_m, height_m and x_m)")
+    ] = None,
+    case: Annotated[
+        Path | None,
+        typer.Option(
+            help="case file with panels, eyes, images and fov, for any number of eyes (replaces the options for the "
+            "pictures, the eyes and the panels)"
+        ),
+    ] = None,
     right: Annotated[
         Path | None, typer.Option(help="picture for the right eye (omit this option if --left contains both views)")
     ] = None,
@@ -55,20 +65,36 @@ def solve(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print the contents of solve.json")] = False,
 ) -> None:
-    """Compute the layers for two still pictures, and measure how well each eye sees its picture.
+    """Compute the layers for still pictures, and measure how well each eye sees its picture.
 
     Example: phasestack solve --left l.png --right r.png --left-eye 0.6 -0.03 0 --right-eye 0.6 0.03 0 --fov 40
     --panels panels.json --out out/solve
+
+    For any number of eyes: phasestack solve --case case.json --out out/solve
     """
-    from runtime.commands.solving import Eyes, Files, solve_pair
+    from runtime.clock import Stopwatch
+    from runtime.commands.solving import Eyes, Files, asked_for, case_asked_for, solve_pictures
     from runtime.support.figures import shown
 
     with blame_option("solve", model=model):
-        result = solve_pair(
-            Files(left, right, layout),
-            Eyes(left_eye, right_eye, fov, camera),
-            panels,
+        watch = Stopwatch()
+        given: dict[str, object] = {
+            "--left": left,
+            "--right": right,
+            "--layout": layout,
+            "--panels": panels,
+            "--camera": camera,
+        }
+        given |= {"--camera": camera, "--left-eye": left_eye, "--right-eye": right_eye}
+        if case is not None:
+            asked = case_asked_for(case, [option for option, value in given.items() if value is not None])
+        else:
+            asked = asked_for(Files.of(left, right, layout), Eyes(left_eye, right_eye, fov, camera), panels)
+        watch.lap("read pictures")
+        result = solve_pictures(
+            asked,
             out,
+            watch,
             model=model,
             repeat=repeat,
             eye_sigma_mm=eye_sigma_mm,

@@ -27,6 +27,7 @@ from runtime.optics.disparity import disparity_doubts
 from runtime.optics.stack import PanelStack
 from runtime.plan.savings import Measured, network_items
 from runtime.records import F64
+from runtime.report.pairs import read_case
 from runtime.support.artifacts import OutputFolder, write_json
 from runtime.support.gl import offscreen_context
 from runtime.support.picture_file import read_image
@@ -54,6 +55,13 @@ class Files:
     right: Path | None
     layout: str | None  # how the views are arranged if both are in one file
 
+    @classmethod
+    def of(cls, left: Path | None, right: Path | None, layout: str | None) -> Files:
+        """Return the files. Raises InputError if the left picture is missing."""
+        if left is None:
+            raise InputError("solve", "--left", "is required without --case; pass the left eye's picture")
+        return cls(left, right, layout)
+
     @property
     def name(self) -> str:
         return self.left.name if self.right is None else f"{self.left.name} and {self.right.name}"
@@ -76,11 +84,48 @@ class Files:
         return pictures
 
 
-def solve_pair(
-    files: Files,
-    eyes: Eyes,
-    panels: Path,
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """Validated pictures to solve, as seen by eyes that look at the stack's origin."""
+
+    name: str  # of the files
+    pictures: list[Any]  # each eye's picture, (h, w, 3 or 4) uint8
+    stack: PanelStack
+    eyes_m: F64  # (V, 3) frame `stack`
+    fov_deg: float
+    is_resampled: bool = False  # True if the pictures were taken by other cameras
+
+
+def asked_for(files: Files, eyes: Eyes, panels: Path | None) -> Asked:
+    """Read a stereo pair and the panels. Raises InputError if a file or an option cannot be used."""
+    if panels is None:
+        raise InputError("solve", "--panels", "is required without --case; pass a file with width_m, height_m and x_m")
+    pictures = files.read()
+    stack = load_stack(panels, width_px=pictures[0].shape[1], height_px=pictures[0].shape[0])
+    pictures, eyes_m, fov_deg = taken(pictures, eyes, stack)
+    return Asked(files.name, pictures, stack, eyes_m, fov_deg, eyes.cameras is not None)
+
+
+def case_asked_for(case: Path, others: list[str]) -> Asked:
+    """Read a case file.
+
+    Args:
+        case: The file.
+        others: Options given besides that the file replaces.
+
+    Raises:
+        InputError: The file cannot be used, or `others` is not empty.
+    """
+    if others:
+        raise InputError("solve", others[0], "is part of the case file; omit it, or omit --case")
+    pair = read_case(case)
+    return Asked(case.name, list(pair.images), pair.stack, pair.eyes_m, pair.fov_deg)
+
+
+def solve_pictures(
+    asked: Asked,
     out: Path,
+    watch: Stopwatch,
     *,
     model: str,
     repeat: int,
@@ -88,19 +133,15 @@ def solve_pair(
     backend: str | None,
     plan: bool,
 ) -> dict[str, Any]:
-    """Solve a stereo pair, write the layers and pictures, and return the contents of solve.json.
+    """Solve pictures, write the layers and the eyes' views, and return the contents of solve.json.
 
-    Raises InputError if a file, an option or the given eye positions cannot be used.
+    Raises InputError if an option or the given eye positions cannot be used.
     """
-    watch = Stopwatch()
+    pictures, stack, eyes_m, fov_deg = asked.pictures, asked.stack, asked.eyes_m, asked.fov_deg
     settings = with_options(Settings(), model=model, backend=backend).model
     cv2.setNumThreads(settings.threads)
-    pictures = files.read()
-    stack = load_stack(panels, width_px=pictures[0].shape[1], height_px=pictures[0].shape[0])
-    pictures, eyes_m, fov_deg = taken(pictures, eyes, stack)
     for line in doubts(eyes_m, stack, fov_deg=fov_deg, size=(pictures[0].shape[1], pictures[0].shape[0])):
         typer.echo(f"phasestack: {line}", err=True)
-    watch.lap("read pictures")
     with ExitStack() as contexts, ExitStack() as cleanup:
 
         def context() -> Any:
@@ -118,10 +159,8 @@ def solve_pair(
 
         def solve() -> Prediction:
             tell("solving", len(inference_ms), repeat + 1)  # the first run is the warm-up
-            left, right = pictures
             prediction = solve_still(
-                left,
-                right,
+                *pictures,
                 eyes_m=eyes_m,
                 fov_deg=fov_deg,
                 predictor=predictor,
@@ -145,19 +184,21 @@ def solve_pair(
             except ValueError as error:
                 why = f"this eye cannot see the display: {error}"
                 raise InputError("solve", "--left-eye", why) from None
-            notes = disparity_doubts(pictures, eyes_m, stack, fov_deg=fov_deg, parallel=eyes.cameras is None)
+            notes = []
+            if len(pictures) == 2:
+                notes = disparity_doubts(pictures, eyes_m, stack, fov_deg=fov_deg, parallel=not asked.is_resampled)
             for note in notes:
                 typer.echo(f"phasestack: {note}", err=True)
-            line = f"{files.name}, model {predictor.name}, solved for a tracking error of "
+            line = f"{asked.name}, model {predictor.name_with(len(pictures))}, solved for a tracking error of "
             line += f"{eye_sigma_mm:g} mm; PSNR with one ray per pixel, as published: {quality.psnr_db:.1f} dB"
             tell("writing", 0)
             seen.write(folder.staging, lines=[line, *notes])
             watch.lap("measure and write")
-            items = network_items(ContentInfo(files.name), Measured(left_out=done.answer.savings))
+            items = network_items(ContentInfo(asked.name), Measured(left_out=done.answer.savings))
             result = quality.table() | {
                 "inference_ms": round(float(np.median(inference_ms[-repeat:])), 3),
                 "total_ms": round(done.median_ms, 3),
-                "model": predictor.name,
+                "model": predictor.name_with(len(pictures)),
                 "provider": predictor.provider,
                 "backend": predictor.backend,
                 "eye_sigma_mm": eye_sigma_mm,

@@ -54,6 +54,11 @@ class StackGeometry(Section):
         description="tilt of each panel, given as the slope of x to the viewer's right and upwards, as measured by "
         "`calibrate panels` (leave empty if the panels are parallel)",
     )
+    colour: Annotated[tuple[bool, ...], Field(max_length=PANELS_MOST)] = Field(
+        (),
+        description="for each panel from rear to front, whether it has colour filters; a panel without them is 3 to 6 "
+        "times as bright, and shows one value for all three colours (leave empty if all panels have filters)",
+    )
     registered_from_m: Point = Field(
         (0.5, 0.0, 0.0),
         description="eye position (in the stack frame) from which the registered panels look parallel",
@@ -65,6 +70,12 @@ class StackGeometry(Section):
             raise ValueError(f"tilt: must have {len(self.x_m)} entries (one per panel), but has {len(self.tilt)}")
         if any(any(slopes) for slopes in self.tilt) and self.registered_from_m[0] <= self.x_m[-1]:
             raise ValueError("registered_from_m: must be in front of the front panel")
+        return self
+
+    @model_validator(mode="after")
+    def _coloured(self) -> StackGeometry:
+        if len(self.colour) not in (0, len(self.x_m)):
+            raise ValueError(f"colour: must have {len(self.x_m)} entries (one per panel), but has {len(self.colour)}")
         return self
 
     @model_validator(mode="after")
@@ -92,7 +103,8 @@ class StackGeometry(Section):
         tilt = None
         if any(any(slopes) for slopes in self.tilt):
             tilt = Tilt(tuple((0.0, right, up) for right, up in self.tilt), self.registered_from_m)
-        return PanelStack(self.width_m, self.height_m, self.x_m, self.width_px, self.height_px, tilt)
+        colour = () if all(self.colour) else self.colour
+        return PanelStack(self.width_m, self.height_m, self.x_m, self.width_px, self.height_px, tilt, colour)
 
 
 class SensorSettings(Section):

@@ -10,7 +10,7 @@ from textwrap import wrap
 import cv2
 import numpy as np
 
-from runtime.evaluation.displayed import EyeViews
+from runtime.evaluation.displayed import EyeViews, eye_names
 from runtime.optics.carried import intensities
 from runtime.optics.pupil import PUPIL_MM, TRACKING_SIGMA_MM
 from runtime.optics.retina import as_codes
@@ -59,16 +59,18 @@ def contact_sheet(layers: U8, eye_views: EyeViews | None, *, headline: str, line
     names = {0: "layer 0 (rear, at the backlight)", len(layers) - 1: f"layer {len(layers) - 1} (front)"}
     rows = [[(names.get(n, f"layer {n}"), np.ascontiguousarray(layers[n, ..., :3])) for n in range(len(layers))]]
     if eye_views is not None:
-        for side, eye in enumerate(("left", "right")):
+        for side, name in enumerate(eye_names(len(eye_views.seen))):
+            side_name, _, viewer = name.partition("-")
+            eye = f"{side_name} eye of viewer {viewer}" if viewer else f"{side_name} eye"
             seen = eye_views.seen[side]
             target = intensities(eye_views.wanted[side])
             shown = np.where(seen.mask[..., None], seen.image, 0.94)
             error = np.where(seen.mask[..., None], np.abs(seen.image - target) * ERROR_GAIN, 0.94)
             rows.append(
                 [
-                    (f"{eye} eye: target", as_codes(target)),
-                    (f"{eye} eye: seen through the layers", as_codes(shown)),
-                    (f"{eye} eye: error x {ERROR_GAIN} (black is perfect)", as_codes(error)),
+                    (f"{eye}: target", as_codes(target)),
+                    (f"{eye}: seen through the layers", as_codes(shown)),
+                    (f"{eye}: error x {ERROR_GAIN} (black is perfect)", as_codes(error)),
                 ]
             )
     columns = max(len(row) for row in rows)

@@ -27,41 +27,49 @@ SIGMAS_MM = (0.0, 1.0, 2.0)  # tracking errors: none, a good tracker's, and twic
 
 @dataclass(frozen=True, slots=True)
 class EyeViews:
-    """The images both eyes see through the layers, with the target pictures and the measured quality."""
+    """The images that the eyes see through the layers, with the targets and the measured quality."""
 
-    seen: tuple[Retina, ...]  # the left and right eyes' images
-    wanted: tuple[Picture, ...]  # the left and right eyes' targets
+    seen: tuple[Retina, ...]  # the image that each eye sees
+    wanted: tuple[Picture, ...]  # the target for each eye
     quality: Quality  # measured exactly at the eyes the layers were solved for or aligned to
     stack: PanelStack
-    eyes_m: F64  # (2, 3) left and right eye, frame `stack`
+    eyes_m: F64  # (V, 3) eye positions, frame `stack`
     fov_deg: float  # horizontal field of view of the images and targets
 
     def viewer(self, layers: U8, text: Sequence[str], *, relief: F32 | None = None) -> str:
         """Return an HTML viewer page for layers that were solved for the eyes `eyes_m`.
+
+        The page shows the first viewer's two views.
 
         Args:
             layers: Layers from rear to front, shape (N, h, w, 3 or 4).
             text: The page's title, followed by lines of text.
             relief: Relief of the content in the layers, shape (h, w) (`optics.relief`).
         """
-        wanted, eyes_m = [as_codes(intensities(picture)) for picture in self.wanted], np.asarray(self.eyes_m)
+        shown = [0, min(1, len(self.wanted) - 1)]  # the page shows the first viewer's eyes
+        wanted, eyes_m = [as_codes(intensities(self.wanted[n])) for n in shown], np.asarray(self.eyes_m)[shown]
         return viewer_html(layers, wanted, self.stack, eyes_m=eyes_m, fov_deg=self.fov_deg, text=text, relief=relief)
 
     def write(self, folder: Path) -> None:
         """Write the images and targets to a folder as `seen-left.png`, `wanted-left.png` and so on."""
 
         def write(side: int) -> None:
-            eye = ("left", "right")[side]
+            eye = eye_names(len(self.seen))[side]
             write_png(folder / f"seen-{eye}.png", self.seen[side].codes())
             write_png(folder / f"wanted-{eye}.png", as_codes(intensities(self.wanted[side])))
 
-        parallel_map(write, range(2))
+        parallel_map(write, range(len(self.seen)))
+
+
+def eye_names(count: int) -> tuple[str, ...]:
+    """Return the eyes' names: left, right, left-2, right-2 and so on, where 2 is the second viewer."""
+    return tuple(("left", "right")[n % 2] + (f"-{n // 2 + 1}" if n > 1 else "") for n in range(count))
 
 
 def displayed(
     layers: U8, wanted: Sequence[Picture], stack: PanelStack, *, eyes_m: F64, fov_deg: float, similarity: bool = True
 ) -> EyeViews:
-    """Compute the images that two eyes see through layers, and compare them with targets.
+    """Compute the images that eyes see through layers, and compare them with targets.
 
     Targets with the panels' aspect ratio are compared at the panels' resolution. Other targets keep their resolution,
     unless they have more pixels than a panel, in which case they are reduced.
@@ -70,7 +78,7 @@ def displayed(
         layers: Layers from rear to front, shape (N, H, W, 3 or 4).
         wanted: Each eye's target picture.
         stack: Panel geometry.
-        eyes_m: Left and right eyes, shape (2, 3), in the `stack` frame.
+        eyes_m: Eye positions, shape (V, 3), in the `stack` frame.
         fov_deg: The targets' horizontal field of view.
         similarity: Compute SSIM. If False, SSIM is NaN.
 

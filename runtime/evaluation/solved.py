@@ -1,4 +1,4 @@
-"""Evaluate a still pair's layers: compute retina images and quality, and write the result files."""
+"""Evaluate the layers of a still solution: compute retina images and quality, and write the result files."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ WHOLE_PX = 1920 * 1200  # light is measured at every pixel of a picture that has
 
 @dataclass(frozen=True, slots=True)
 class PairQuality:
-    """Quality of layers at a pair's eyes (docs/contracts.md, Error).
+    """Quality of layers at the eyes they were solved for (docs/contracts.md, Error).
 
     Mappings are keyed by tracking error in mm: "0", "1", "2". A value is NaN if the tracking error moves an eye so far
     that it sees no part of the panels. SSIM is NaN if it was not requested.
@@ -33,7 +33,7 @@ class PairQuality:
     expected_db: BySigma  # with one ray per pixel
     psnr_db: float  # with one ray per pixel, at exactly known eyes
     ssim: float
-    eye_psnr_db: tuple[float, ...]  # the left and right eyes' PSNR, measured like `psnr_db`
+    eye_psnr_db: tuple[float, ...]  # each eye's PSNR, measured like `psnr_db`
     standard_error_db: BySigma = field(default_factory=dict)  # that of `light_db`; empty unless the pixels were sampled
 
     def table(self) -> dict[str, Any]:
@@ -49,20 +49,20 @@ class PairQuality:
 
 @dataclass(frozen=True)
 class SolvedPair:
-    """Layers for a pair of pictures. The retina images and the quality are computed on first access.
+    """Layers for a set of pictures, one for each eye. The retina images and the quality are computed on first access.
 
     On first access, ValueError is raised if an eye is behind a panel or sees no part of the panels.
     """
 
     layers: U8  # (N, h, w, 3 or 4) layers from rear to front
-    pictures: Sequence[Picture]  # the left and right eyes' targets
+    pictures: Sequence[Picture]  # the target for each eye
     stack: PanelStack
-    eyes_m: F64  # (2, 3) left and right eye, frame `stack`
+    eyes_m: F64  # (V, 3) eye positions, frame `stack`
     fov_deg: float  # the targets' horizontal field of view
 
     @cached_property
     def eye_views(self) -> EyeViews:
-        """Both eyes' retina images, and the targets to compare them with."""
+        """The eyes' retina images, and the targets to compare them with."""
         return displayed(self.layers, self.pictures, self.stack, eyes_m=self.eyes_m, fov_deg=self.fov_deg)
 
     @cached_property

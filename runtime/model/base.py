@@ -50,6 +50,10 @@ class Predictor(ABC):
         """Return True if `solve` accepts pictures held in this OpenGL context's textures (`DrawnPicture`)."""
         return False
 
+    def name_with(self, views: int) -> str:
+        """Return the model's name, with a note if its network does not serve this many views."""
+        return self.name
+
     def on_panels(self, stack: PanelStack) -> Predictor | None:
         """Return a copy of the model for panels of another size, used to time backends.
 

@@ -58,11 +58,11 @@ class Geometry:
     """The pixels that one solution computes, and the rays it considers."""
 
     stack: PanelStack
-    eyes_m: F64  # (2, 3) left and right, frame `stack`
+    eyes_m: F64  # (V, 3), frame `stack`
     boxes: tuple[PixelRect, ...]  # solved pixels of each panel
     kept: PixelRect  # part of the middle panel's box that rays pass through
     rays: PixelRect  # picture pixels whose rays pass through `kept`
-    middle_from_rays: F64  # (2, 3, 3) for each eye, from pixels in `rays` to pixels in the middle panel's box
+    middle_from_rays: F64  # (V, 3, 3) for each eye, from pixels in `rays` to pixels in the middle panel's box
     taper_px: tuple[float, float] = (0.0, 0.0)  # width of a window's taper, right and down, in middle-panel pixels
 
     @property
@@ -102,7 +102,7 @@ class Geometry:
             eye_sigma_m: Standard deviation of the tracking error.
 
         Returns:
-            (2P, N, 3, 3) homographies. The first axis lists the left and the right eye, for each head position in turn.
+            (P·V, N, 3, 3) homographies. The first axis lists all eyes for each head position in turn.
         """
         right, up = stack_from_eye(self.eyes_m.mean(axis=0))[:3, 0], np.array([0.0, 0.0, 1.0])
         sure = self.rays.height_px == 1 or self._moved_px(eye_sigma_m) < KNOWN_PX
@@ -158,11 +158,11 @@ def geometry_of(
     kept: PixelRect | None = None,
     taper_px: tuple[float, float] = (0.0, 0.0),
 ) -> Geometry:
-    """Return the geometry for those rays of both views that pass through a part of the middle panel.
+    """Return the geometry for those rays of all views that pass through a part of the middle panel.
 
     Args:
-        eyes_m: (2, 3) left and right eye in frame `stack`.
-        views: The left and the right eye's view.
+        eyes_m: (V, 3) eye positions in frame `stack`.
+        views: What each eye should see.
         boxes: Pixels to solve on each panel.
         kept: Part of the middle panel that the rays pass through. By default, the middle panel's box.
         taper_px: Width of a window's taper, right and down, in middle-panel pixels.
@@ -233,7 +233,7 @@ def visible_boxes(eyes_m: F64, stack: PanelStack) -> tuple[PixelRect, ...]:
     If the eyes see nothing through all the panels, there is nothing to solve, and the boxes have the minimum size.
 
     Args:
-        eyes_m: (2, 3) left and right eye in frame `stack`.
+        eyes_m: (V, 3) eye positions in frame `stack`.
     """
     middle_x_m, half = stack.x_m[stack.count // 2], np.array([stack.width_m, stack.height_m]) / 2
     lows, highs = [], []

@@ -19,6 +19,7 @@ from runtime.support.threads import parallel_map
 
 TRACKING_SIGMA_M = TRACKING_SIGMA_MM / 1e3
 NOWHERE = PixelRect(0, 0, 0, 0)
+VIEWS_MOST = 8  # maximum number of views in a job
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,11 +38,12 @@ class SolveWindow:
 
 @dataclass(frozen=True)
 class Targets:
-    """Both eyes' target pictures, and the rays of their pixels through the panels."""
+    """The views to show, and the rays of their pixels through the panels."""
 
     stack: PanelStack  # the panels, with the raster to solve, which may be coarser than the display's
-    eyes_m: F64  # (2, 3) left and right, frame `stack`
-    views: tuple[TargetView, TargetView]  # left and right
+    # (V, 3) eye positions, frame `stack`: the first viewer's left and right eye, then the next viewer's
+    eyes_m: F64
+    views: tuple[TargetView, ...]  # what each of these eyes should see
 
     @cached_property
     def visible(self) -> Geometry:
@@ -59,18 +61,17 @@ class Targets:
         boxes = (window.box,) * self.stack.count
         return geometry_of(self.stack, self.eyes_m, self.views, boxes=boxes, kept=window.kept, taper_px=window.taper_px)
 
-    def reduced(self, reduction: int) -> tuple[TargetView, TargetView]:
-        """Return the left and right views averaged down by `reduction` (`reduced_view`). Cached."""
+    def reduced(self, reduction: int) -> tuple[TargetView, ...]:
+        """Return the views averaged down by `reduction` (`reduced_view`). Cached."""
         if reduction not in self._reduced:
             middle = self.stack.panel(self.stack.count // 2)
             # Read textures back here, because only their context's thread can do so.
             views = [TargetView(view.pixels, view.plane_from_picture) for view in self.views]
-            left, right = parallel_map(lambda view: reduced_view(view, middle, reduction), views)
-            self._reduced[reduction] = left, right
+            self._reduced[reduction] = tuple(parallel_map(lambda view: reduced_view(view, middle, reduction), views))
         return self._reduced[reduction]
 
     @cached_property
-    def _reduced(self) -> dict[int, tuple[TargetView, TargetView]]:
+    def _reduced(self) -> dict[int, tuple[TargetView, ...]]:
         return {}
 
 
@@ -87,7 +88,7 @@ class Job:
     """The input for one solution. `runtime.model.trim` changes a few fields to make it cheaper."""
 
     targets: Targets
-    # Standard deviation, along each axis (right and up), of the tracking error, which both eyes share. 0: the eyes are
+    # Standard deviation, along each axis (right and up), of the tracking error, which all eyes share. 0: the eyes are
     # known exactly.
     eye_sigma_m: float = TRACKING_SIGMA_M
     window: SolveWindow | None = None  # None: solve everything the eyes see
@@ -98,8 +99,8 @@ class Job:
     relief: F32 | None = None  # (h, w) relief of the content on the middle panel, for the presenter (`optics.relief`)
 
     @property
-    def views(self) -> tuple[TargetView, TargetView]:
-        """The left and right eyes' views."""
+    def views(self) -> tuple[TargetView, ...]:
+        """What each eye should see."""
         return self.targets.views
 
     @property
@@ -109,7 +110,7 @@ class Job:
 
     @property
     def eyes_m(self) -> F64:
-        """Left and right eye, (2, 3) in frame `stack`."""
+        """Eye positions, (V, 3) in frame `stack`."""
         return self.targets.eyes_m
 
     @property
@@ -122,26 +123,25 @@ class Job:
 
 def drawn_views(
     pictures: Sequence[U8 | DrawnPicture], stack: PanelStack, window: SolveWindow | None = None
-) -> tuple[TargetView, TargetView]:
-    """Return the left and right views for pictures drawn on the middle panel's pixels.
+) -> tuple[TargetView, ...]:
+    """Return the views for pictures drawn on the middle panel's pixels.
 
     Args:
-        pictures: Left and right (h, w, 3 or 4) picture.
+        pictures: Each eye's (h, w, 3 or 4) picture.
         window: Window covered by the pictures. If None, they cover the whole panel.
     """
     raster = stack.panel(stack.count // 2)
     if window is not None:
         raster = window.box.cut(raster)
-    left, right = (TargetView(picture, raster.plane_from_raster()) for picture in pictures)
-    return left, right
+    return tuple(TargetView(picture, raster.plane_from_raster()) for picture in pictures)
 
 
 def drawn_job(pictures: Sequence[U8 | DrawnPicture], eyes_m: F64, stack: PanelStack) -> Job:
     """Return a job, without a window, for pictures drawn on the middle panel's pixels.
 
     Args:
-        pictures: Left and right (h, w, 3 or 4) picture.
-        eyes_m: (2, 3) left and right eye in frame `stack`.
+        pictures: Each eye's (h, w, 3 or 4) picture.
+        eyes_m: (V, 3) eye positions in frame `stack`.
     """
     return Job(Targets(stack, eyes_m, drawn_views(pictures, stack)))
 

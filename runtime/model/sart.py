@@ -1,8 +1,9 @@
 """SART (simultaneous algebraic reconstruction technique) on one branch of Malus' law, for comparison.
 
 The technique (Andersen and Kak 1984) is the published solver for polarization fields (Lanman et al. 2011). This
-implementation supports 2 to 8 panels. Each iteration corrects all panels at once, by equal shares of both eyes'
-residual phases. The relaxation factor is the best value found by trial and error.
+implementation supports 2 to 8 panels and any number of views. Each iteration corrects all panels at once, by equal
+shares of all views' residual phases. A panel without colour filters gets the mean correction of the three channels. The
+relaxation factor is the best value found by trial and error.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64
 
 ITERATIONS = 10
-RELAXATION = 1.7  # factor for the eyes' mean residual, found by trial and error; factors of 2 or more diverge
+RELAXATION = 1.7  # factor for the views' mean residual, found by trial and error; factors of 2 or more diverge
 
 
 class SartPredictor(Predictor):
@@ -51,7 +52,7 @@ class SartPredictor(Predictor):
         panels: list[NDArray[np.float32]] = [np.full((*size, 3), rest, np.float32) for _ in range(stack.count)]
         forward = [[self._panel_from_middle(eye, n) for n in range(stack.count)] for eye in job.eyes_m]
         back = [[np.linalg.inv(matrix) for matrix in matrices] for matrices in forward]
-        share = np.float32(self._relaxation / (2 * stack.count))
+        share = np.float32(self._relaxation / (len(targets) * stack.count))
         watch.lap("prepare")
         for _ in range(self.iterations):
             residuals = [
@@ -59,9 +60,10 @@ class SartPredictor(Predictor):
                 for target, matrices in zip(targets, forward, strict=True)
             ]
             for n, panel in enumerate(panels):
-                panel += share * sum(
+                correction = sum(
                     _warp(residual, matrices[n]) for residual, matrices in zip(residuals, back, strict=True)
                 )
+                panel += share * (correction.mean(axis=2, keepdims=True) if stack.is_grey(n) else correction)
                 np.clip(panel, 0, 1, out=panel)
         watch.lap("inference")
         layers = np.full((stack.count, stack.height_px, stack.width_px, 4), 255, np.uint8)

@@ -7,6 +7,7 @@ The algorithm is described in docs/mathematics.md. This module calls the operati
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from time import perf_counter_ns
 
 from runtime.clock import Stopwatch
@@ -18,6 +19,7 @@ from runtime.model.device import SolverBackend, SolverState
 from runtime.model.geometry import Geometry
 from runtime.model.job import Job
 from runtime.model.proposal import Proposal
+from runtime.model.sart import SartPredictor
 from runtime.optics.malus import rest_code
 from runtime.optics.stack import PanelStack
 
@@ -72,6 +74,9 @@ class StepPredictor(Predictor):
     def reads_textures_of(self, context: object) -> bool:
         return context is not None and self._backend.context is context
 
+    def name_with(self, views: int) -> str:
+        return self.name if views == 2 and not self.stack.colour else f"sart (in place of {self.name})"
+
     def on_panels(self, stack: PanelStack) -> StepPredictor | None:
         if not self.any_raster or stack.count != 3:
             return None
@@ -83,6 +88,8 @@ class StepPredictor(Predictor):
 
     def solve(self, job: Job, watch: Stopwatch | None = None) -> Prediction:
         watch = watch or Stopwatch(*STAGES)
+        if len(job.views) != 2 or job.stack.colour:  # the kernels solve two views on panels with colour filters
+            return SartPredictor(job.stack).solve(replace(job, window=None, channels=3), watch)
         if job.stack not in self._rasters:
             state = self._backend.state(job.stack, threads=self._threads)
             self._rasters[job.stack] = state, LayerPool(job.stack)

@@ -1,4 +1,4 @@
-"""Solve a still stereo pair, for the `solve` command, the report and the calibration charts."""
+"""Solve still pictures, for the `solve` command, the report and the calibration charts."""
 
 from __future__ import annotations
 
@@ -22,30 +22,27 @@ RAYS_PX = 0.6, 1.6  # pictures with fewer or more pixels per panel pixel are res
 
 
 def solve_still(
-    left: U8,
-    right: U8,
-    *,
+    *pictures: U8,
     eyes_m: F64,
     fov_deg: float,
     predictor: Predictor,
     eye_sigma_mm: float = TRACKING_SIGMA_MM,
     trimmed: bool = False,
 ) -> Prediction:
-    """Compute the layers for a stereo pair taken by cameras aimed at the stack's origin.
+    """Compute the layers for pictures taken by cameras aimed at the stack's origin.
 
     The cameras must have been at the eye positions. The solver follows the rays of the picture pixels.
 
     Args:
-        left: (h, w, 3 or 4) picture for the left eye.
-        right: (h, w, 3 or 4) picture for the right eye.
-        eyes_m: (2, 3) left and right eye in frame `stack`.
+        *pictures: Each eye's (h, w, 3 or 4) picture.
+        eyes_m: (V, 3) eye positions in frame `stack`, in the order of the pictures.
         fov_deg: The pictures' horizontal field of view.
         eye_sigma_mm: Standard deviation of the tracking error.
         trimmed: True to skip work that the pictures do not need (`trim`), if the model supports it.
     """
     watch = Stopwatch(*STAGES)
-    pictures = [np.ascontiguousarray(picture[..., :3]) for picture in (left, right)]
-    views = captured_views(pictures, eyes_m, predictor.stack, fov_deg=fov_deg)
+    codes = [np.ascontiguousarray(picture[..., :3]) for picture in pictures]
+    views = captured_views(codes, eyes_m, predictor.stack, fov_deg=fov_deg)
     job = Job(Targets(predictor.stack, eyes_m, views), eye_sigma_m=eye_sigma_mm / 1e3)
     if trimmed and predictor.trims:
         job = trim(job)
@@ -53,15 +50,14 @@ def solve_still(
     return predictor.solve(job, watch)
 
 
-def captured_views(
-    pictures: Sequence[U8], eyes_m: F64, stack: PanelStack, *, fov_deg: float
-) -> tuple[TargetView, TargetView]:
-    """Return a stereo pair's views. Pictures are resized if their resolution differs from the panels'.
+def captured_views(pictures: Sequence[U8], eyes_m: F64, stack: PanelStack, *, fov_deg: float) -> tuple[TargetView, ...]:
+    """Return the views for captured pictures of one size.
+
+    Pictures are resized if their resolution differs from the panels'.
 
     Args:
-        pictures: Left and right (h, w, 3) picture, taken from the eye positions with the camera aimed at the stack's
-            origin.
-        eyes_m: (2, 3) left and right eye in frame `stack`.
+        pictures: Each eye's (h, w, 3) picture, taken from the eye position with the camera aimed at the stack's origin.
+        eyes_m: (V, 3) eye positions in frame `stack`.
         fov_deg: The pictures' horizontal field of view.
     """
     height, width = pictures[0].shape[:2]
@@ -75,8 +71,7 @@ def captured_views(
         pictures = [np.asarray(cv2.resize(picture, size, interpolation=method), np.uint8) for picture in pictures]
         resized = np.diag([size[0] / width, size[1] / height, 1.0])
         at = [resized @ projection for projection in at]
-    left, right = (
+    return tuple(
         TargetView(picture, middle.plane_from_raster() @ np.linalg.inv(image_from_raster(projection, middle)))
         for picture, projection in zip(pictures, at, strict=True)
     )
-    return left, right

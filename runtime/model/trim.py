@@ -60,7 +60,7 @@ def extent_window(
     Args:
         extent: Middle-panel pixels. Outside them, both eyes see only the background.
         colour: The background's 8-bit codes.
-        eyes_m: (2, 3) left and right eye in frame `stack`.
+        eyes_m: (V, 3) eye positions in frame `stack`.
         before: The previous solution's window, which is kept if it still fits.
 
     Returns:
@@ -82,22 +82,24 @@ def differing_window(job: Job, before: SolveWindow | None = None) -> SolveWindow
         return None
     stack = job.stack
     if all(_on_middle_panel(view, stack) for view in job.views):
-        left, right = (view.pixels for view in job.views)
+        pictures = [view.pixels for view in job.views]
         origin, scale = (0, 0), 1
     else:
-        left, right, origin = _compared(job)
+        pictures, origin = _compared(job)
         scale = COMPARED
+    first, *others = pictures
 
     def window_of(box: PixelRect) -> SolveWindow | None:
-        grown = PixelRect(*(first + scale * at for first, at in zip(origin * 2, box.corners)))
-        return _window_around(grown, job.eyes_m, stack, before, steep=steepness_beside(left, box))
+        grown = PixelRect(*(begin + scale * at for begin, at in zip(origin * 2, box.corners)))
+        return _window_around(grown, job.eyes_m, stack, before, steep=steepness_beside(first, box))
 
     # A quick comparison recognises windows that would be too large. An exact comparison is needed only for the others.
-    box, window = coarse_box(left, right), None
+    box, window = union([NOWHERE, *(coarse_box(first, other) for other in others)]), None
     if box.width_px:
         window = window_of(box)
     if not box.width_px or window is not None:
-        box = differing_box(left, right, known=box)
+        for other in others:
+            box = differing_box(first, other, known=box)
         window = window_of(box) if box.width_px else SolveWindow(NOWHERE, NOWHERE, (0.0, 0.0))
     return window
 
@@ -109,10 +111,10 @@ def _on_middle_panel(view: TargetView, stack: PanelStack) -> bool:
     return same_size and np.allclose(view.plane_from_picture, middle.plane_from_raster(), rtol=0, atol=1e-9)
 
 
-def _compared(job: Job) -> tuple[U8, U8, tuple[int, int]]:
-    """Return the left and the right picture on a coarse raster over the visible part of the middle panel.
+def _compared(job: Job) -> tuple[list[U8], tuple[int, int]]:
+    """Return the eyes' pictures on a coarse raster over the visible part of the middle panel.
 
-    The third value is the (column, row) of the panel pixel where the raster begins.
+    The second value is the (column, row) of the panel pixel where the raster begins.
     """
     visible = job.targets.visible
     box, middle = visible.boxes[visible.middle], job.stack.panel(visible.middle)
@@ -122,11 +124,11 @@ def _compared(job: Job) -> tuple[U8, U8, tuple[int, int]]:
         [0.0, box.height_px / size[0], box.v0],
         [0.0, 0.0, 1.0],
     ])  # fmt: skip
-    left, right = (
+    pictures = [
         picture_on(view, middle, middle_from_result=middle_from_compared, edge=cv2.BORDER_REPLICATE, size=size)
         for view in job.targets.reduced(COMPARED)
-    )
-    return left, right, (box.u0, box.v0)
+    ]
+    return pictures, (box.u0, box.v0)
 
 
 def _window_around(
@@ -199,10 +201,10 @@ def parallax_margin_px(eyes_m: F64, stack: PanelStack) -> F64:
     """Return how far rays through the middle panel's centre are shifted on each panel.
 
     Args:
-        eyes_m: (2, 3) left and right eye in frame `stack`.
+        eyes_m: (V, 3) eye positions in frame `stack`.
 
     Returns:
-        (2, N, 2) shifts in pixels. The axes are the eye, the panel, and the direction (right, down). For rays through
+        (V, N, 2) shifts in pixels. The axes are the eye, the panel, and the direction (right, down). For rays through
         other points on the middle panel, the shifts are approximate.
     """
     return np.asarray(_eyes_px(eyes_m, stack)[:, None] * _weights(eyes_m, stack)[..., None], np.float64)
@@ -237,10 +239,9 @@ def taper_px(eyes_m: F64, stack: PanelStack, *, parallaxes: float) -> tuple[floa
     """Convert a taper's width from parallaxes to pixels (right, down).
 
     Args:
-        eyes_m: (2, 3) left and right eye in frame `stack`.
+        eyes_m: (V, 3) eye positions in frame `stack`.
     """
-    left, right = parallax_margin_px(eyes_m, stack)
-    across, down = np.abs(left - right).max(axis=0) * parallaxes
+    across, down = np.ptp(parallax_margin_px(eyes_m, stack), axis=0).max(axis=0) * parallaxes
     return float(across), float(down)
 
 
@@ -252,7 +253,7 @@ def whole_rays(box: PixelRect, eyes_m: F64, stack: PanelStack) -> PixelRect:
 
     Args:
         box: Window in panel pixels.
-        eyes_m: (2, 3) left and right eye in frame `stack` (not relative to the window).
+        eyes_m: (V, 3) eye positions in frame `stack` (not relative to the window).
     """
     weights = _weights(eyes_m, stack)
     limits = []
@@ -268,15 +269,15 @@ def whole_rays(box: PixelRect, eyes_m: F64, stack: PanelStack) -> PixelRect:
 
 
 def _weights(eyes_m: F64, stack: PanelStack) -> F64:
-    """Return the (2, N) positions of the panels on a scale from the centre panel (0) to each eye (1)."""
+    """Return the (V, N) positions of the panels on a scale from the centre panel (0) to each eye (1)."""
     middle_m = stack.x_m[stack.count // 2]
     return np.asarray((np.array(stack.x_m) - middle_m) / (eyes_m[:, :1] - middle_m), np.float64)
 
 
 def _eyes_px(eyes_m: F64, stack: PanelStack) -> F64:
-    """Return the positions of the two eyes relative to the panels' centre, in pixels.
+    """Return the eyes' positions relative to the panels' centre, in pixels.
 
-    The result is a (2, 2) array of (right, down) rows.
+    The result is a (V, 2) array of (right, down) rows.
     """
     return np.asarray(eyes_m[:, 1:] * (stack.width_px / stack.width_m, -stack.height_px / stack.height_m), np.float64)
 
@@ -287,7 +288,7 @@ def window_around(box: PixelRect, eyes_m: F64, stack: PanelStack, *, parallaxes:
     The window includes margins, and its sides are rounded up to sixteenths of the panel's.
 
     Args:
-        eyes_m: (2, 3) left and right eye in frame `stack`.
+        eyes_m: (V, 3) eye positions in frame `stack`.
         parallaxes: Taper width (`taper_parallaxes`).
 
     Returns:
@@ -298,7 +299,7 @@ def window_around(box: PixelRect, eyes_m: F64, stack: PanelStack, *, parallaxes:
     for axis, (start, end, whole) in enumerate(((box.u0, box.u1, stack.width_px), (box.v0, box.v1, stack.height_px))):
         eyes = eyes_px[:, axis, None]  # relative to the panel's centre, as both ends of the box are below
         before, after = (weights * (start - whole / 2 - eyes)).max(), (weights * (eyes - (end - whole / 2))).max()
-        room = parallaxes * float(np.abs(parallax[0, :, axis] - parallax[1, :, axis]).max()) + MARGIN_PX
+        room = parallaxes * float(np.ptp(parallax[..., axis], axis=0).max()) + MARGIN_PX
         low = max(start - (PANEL_CROSSINGS * max(float(before), 0.0) + room), 0.0)
         high = min(end + (PANEL_CROSSINGS * max(float(after), 0.0) + room), float(whole))
         step = whole / WINDOW_SHARES

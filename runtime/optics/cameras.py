@@ -23,25 +23,26 @@ NAMES = ("left", "right")
 Picture = U8 | F32  # (h, w, 3)
 
 
-def as_cameras(matrices: Any) -> tuple[F64, F64]:
-    """Return the projections and positions of two cameras, given their 3x4 matrices.
+def as_cameras(matrices: Any, *, count: int = 2) -> tuple[F64, F64]:
+    """Return the projections and positions of cameras, given their 3x4 matrices.
 
     Args:
-        matrices: The left and right cameras' matrices, which map metres in frame `stack` to pixels.
+        matrices: The cameras' matrices, which map metres in frame `stack` to pixels.
 
     Returns:
-        The (2, 3, 4) matrices, with signs chosen so that the third homogeneous coordinate is positive in front of the
-        camera, and the (2, 3) positions in metres in frame `stack`.
+        The (V, 3, 4) matrices, with signs chosen so that the third homogeneous coordinate is positive in front of the
+        camera, and the (V, 3) positions in metres in frame `stack`.
 
     Raises:
-        ValueError: `matrices` are not two finite 3x4 matrices, or the left 3x3 part of one of them has no inverse.
+        ValueError: `matrices` are not finite 3x4 matrices, or the left 3x3 part of one of them has no inverse.
     """
     try:
         cameras = np.asarray(matrices, np.float64)
     except (TypeError, ValueError):
         cameras = np.empty(0)
-    if cameras.shape != (2, 3, 4) or not np.isfinite(cameras).all():
-        raise ValueError("must be two 3x4 matrices (left and right) that map metres in the stack frame to pixels")
+    if cameras.shape != (count, 3, 4) or not np.isfinite(cameras).all():
+        told = "two 3x4 matrices (left and right)" if count == 2 else f"{count} 3x4 matrices"
+        raise ValueError(f"must be {told} that map metres in the stack frame to pixels")
     turns = np.linalg.det(cameras[:, :, :3])
     if not (np.abs(turns) > 0).all():
         raise ValueError("must be matrices whose left 3x3 block is invertible")
@@ -53,14 +54,14 @@ def as_cameras(matrices: Any) -> tuple[F64, F64]:
 def looking_at_origin(
     pictures: Sequence[Picture], cameras: F64, eyes_m: F64, stack: PanelStack
 ) -> tuple[list[Picture], float]:
-    """Resample two cameras' pictures as if the cameras had been aimed at the stack's origin.
+    """Resample cameras' pictures as if the cameras had been aimed at the stack's origin.
 
-    The new pictures cover as much of the panels as both originals allow, and are sampled bicubically. If both cameras
+    The new pictures cover as much of the panels as all originals allow, and are sampled bicubically. If all cameras
     are already aimed at the origin, their pictures are returned unchanged.
 
     Args:
-        cameras: (2, 3, 4) projections from frame `stack` to picture pixels (`as_cameras`).
-        eyes_m: (2, 3) camera positions in frame `stack`.
+        cameras: (V, 3, 4) projections from frame `stack` to picture pixels (`as_cameras`).
+        eyes_m: (V, 3) camera positions in frame `stack`.
 
     Returns:
         The resampled (h, w, 3) pictures, and their horizontal field of view in degrees.
@@ -87,8 +88,9 @@ def looking_at_origin(
     def shown(share: F64) -> bool:
         return all(_within(matrix, share * extent, width, height) for matrix in pixels_from_gaze)
 
-    for name, matrix in zip(NAMES, pixels_from_gaze, strict=True):
+    for n, matrix in enumerate(pixels_from_gaze):
         if not _within(matrix, np.zeros(2), width, height):
+            name = NAMES[n] if len(pixels_from_gaze) == 2 else f"{n + 1}."
             raise ValueError(f"the {name} picture does not show the centre of the stack; aim the camera at it")
     both = _most(lambda share: shown(np.array([share, share])))
     share = np.array([both, both])
@@ -142,7 +144,7 @@ def doubts(eyes_m: ArrayLike, stack: PanelStack, *, fov_deg: float, size: tuple[
     """Return a one-line warning for each likely mistake in `eyes_m` or `fov_deg`.
 
     Args:
-        eyes_m: (2, 3) left and right eye in frame `stack`.
+        eyes_m: (V, 3) eye positions in frame `stack`: the first viewer's left and right eye, then the next viewer's.
         fov_deg: The pictures' horizontal field of view.
         size: Picture width and height in pixels.
     """
@@ -151,7 +153,8 @@ def doubts(eyes_m: ArrayLike, stack: PanelStack, *, fov_deg: float, size: tuple[
         warnings.append(
             f"fov_deg: {fov_deg:g} degrees looks like radians; did you mean {math.degrees(fov_deg):.1f} degrees?"
         )
-    if (eyes[1] - eyes[0]) @ stack_from_eye(eyes.mean(0))[:3, 0] < 0:
+    pairs = [eyes[n : n + 2] for n in range(0, len(eyes) - 1, 2)]
+    if any((right - left) @ stack_from_eye((left + right) / 2)[:3, 0] < 0 for left, right in pairs):
         warnings.append("eyes_m: the left eye is to the right of the right eye; swap the eyes if this is not intended")
     width_px, height_px = 64, max(2, round(64 * size[1] / size[0]))
     shares = []

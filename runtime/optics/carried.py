@@ -39,8 +39,8 @@ def carried_db(
     Args:
         layers: (N, H, W, 3 or 4) code values as the panels receive them, rear to front.
         drawn: The (h, w, 3) retina picture for each of the eyes `solved_for_m`, as code values or float in [0, 1].
-        solved_for_m: (2, 3) eyes that the layers were solved for, in frame `stack`.
-        eyes_m: (2, 3) true eye positions in frame `stack`.
+        solved_for_m: (V, 3) eyes that the layers were solved for, in frame `stack`.
+        eyes_m: (V, 3) true eye positions in frame `stack`.
         fov_deg: The retina pictures' horizontal field of view.
 
     Raises:
@@ -57,10 +57,10 @@ def carried_db(
 class AtEyes(TypedDict):
     """Viewing conditions that an expected quality is computed for."""
 
-    eyes_m: ArrayLike  # (2, 3) eyes that the layers were solved for, frame `stack`
+    eyes_m: ArrayLike  # (V, 3) eyes that the layers were solved for, frame `stack`
     fov_deg: float  # the pictures' horizontal field of view
     sigmas_mm: Sequence[float]  # standard deviations of the tracking error to assume
-    seen_from_m: NotRequired[ArrayLike | None]  # (2, 3) true eye positions; by default `eyes_m`
+    seen_from_m: NotRequired[ArrayLike | None]  # (V, 3) true eye positions; by default `eyes_m`
 
 
 def expected_errors(

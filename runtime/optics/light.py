@@ -74,8 +74,8 @@ def squared_errors(
     Args:
         layers: (N, H, W, 3 or 4) code values, rear to front.
         targets: (h, w, 3) intensities, for each of the eyes `solved_for_m`.
-        solved_for_m: (2, 3) eyes that the layers were solved for, in frame `stack`.
-        eyes_m: (2, 3) true eye positions in frame `stack`.
+        solved_for_m: (V, 3) eyes that the layers were solved for, in frame `stack`.
+        eyes_m: (V, 3) true eye positions in frame `stack`.
         fov_deg: The targets' horizontal field of view.
         sampling: Rays to trace.
 
@@ -140,7 +140,7 @@ def view_of(
     """Return one eye's target and rays.
 
     Args:
-        side: 0 for the left eye, 1 for the right eye.
+        side: The eye's number, from 0.
         nominal_m: (3,) eye position that the layers were solved for, in frame `stack`.
         true_m: (3,) true eye position in frame `stack`.
         target: (h, w, 3) intensities that the nominal eye should see.
@@ -159,7 +159,7 @@ def view_of(
 
 
 def first_ray(side: int) -> int:
-    """Return the number of an eye's first ray. The left (0) and right (1) eye share no ray numbers."""
+    """Return the number of an eye's first ray. Eyes share no ray numbers."""
     return side << 40
 
 

@@ -16,7 +16,7 @@ HALF_WINDOW = 5  # pixels on each side of the central pixel in the SSIM window
 
 @dataclass(frozen=True, slots=True)
 class Quality:
-    """PSNR and SSIM over both eyes' images, and the PSNR of each eye's image."""
+    """PSNR and SSIM over the eyes' images, and the PSNR of each eye's image."""
 
     psnr_db: float  # computed from the mean squared error over all counted pixels, channels and eyes
     ssim: float  # mean over the eyes; NaN if not computed

@@ -64,10 +64,15 @@ class PanelStack:
     width_px: int
     height_px: int
     tilt: Tilt | None = None  # None: the panels are parallel
+    colour: tuple[bool, ...] = ()  # for each panel, True if it has colour filters; empty: all panels have
 
     @property
     def count(self) -> int:
         return len(self.x_m)
+
+    def is_grey(self, n: int) -> bool:
+        """Return True if panel `n` has no colour filters: its pixels have one value for all channels."""
+        return bool(self.colour) and not self.colour[n]
 
     @property
     def is_evenly_spaced(self) -> bool:
@@ -91,7 +96,7 @@ class PanelStack:
         if tilt is not None:
             x, y, z = tilt.seen_from_m
             tilt = Tilt(tuple((d, -u, -r) for d, r, u in tilt.depth), (x, -z, -y))
-        return PanelStack(self.height_m, self.width_m, self.x_m, self.height_px, self.width_px, tilt)
+        return PanelStack(self.height_m, self.width_m, self.x_m, self.height_px, self.width_px, tilt, self.colour)
 
     def panel(self, index: int) -> PlaneRaster:
         """Return the pixel grid of panel `index`, treating the panel as parallel to the others."""

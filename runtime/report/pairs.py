@@ -1,4 +1,4 @@
-"""Stereo pairs with their viewing geometry, read from case files or drawn from built-in scenes."""
+"""Pictures with their viewing geometry, read from case files or drawn from built-in scenes."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from pydantic import BaseModel, Field
 
 from runtime.config import StackGeometry, read_table, validated
 from runtime.errors import InputError
+from runtime.model.job import VIEWS_MOST
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack, stack_from_eye
 from runtime.records import F64, U8
@@ -40,12 +41,12 @@ class OffView:
 
 @dataclass(frozen=True, slots=True)
 class StillPair:
-    """Target pictures for two eyes, the eyes' positions, and the panels to show the pictures on."""
+    """Target pictures for two or more eyes, the eyes' positions, and the panels to show the pictures on."""
 
     name: str
     stack: PanelStack
-    eyes_m: F64  # (2, 3) left and right eye, frame `stack`
-    images: tuple[U8, U8]  # (h, w, 3) pictures for the left and right eyes
+    eyes_m: F64  # (V, 3) frame `stack`: the first viewer's left and right eye, then the next viewer's
+    images: tuple[U8, ...]  # each eye's picture, (h, w, 3)
     fov_deg: float  # horizontal field of view
     off: tuple[OffView, ...] = ()  # further targets, for displaced eyes
 
@@ -62,8 +63,9 @@ class CaseFile(BaseModel):
     """A case file's validated contents (docs/contracts.md)."""
 
     panels: dict[str, Any]  # fields of StackGeometry
-    eyes: tuple[Place, Place]  # left and right eye
-    images: tuple[str, str]  # file names, relative to the case file
+    # The first viewer's left and right eye, then the next viewer's
+    eyes: Annotated[tuple[Place, ...], Field(min_length=2, max_length=VIEWS_MOST)]
+    images: tuple[str, ...]  # file names, relative to the case file, in the order of the eyes
     fov: Annotated[float, Field(strict=True, ge=FOV_RANGE_DEG[0], le=FOV_RANGE_DEG[1])]
     off: tuple[OffEntry, ...] = ()
 
@@ -87,13 +89,22 @@ def read_pairs(folder: Path) -> list[StillPair]:
     return pairs
 
 
+def read_case(path: Path) -> StillPair:
+    """Read a case file. Raises InputError if it is invalid."""
+    return _case(path, read_table(path))
+
+
 def _case(path: Path, table: dict[str, Any]) -> StillPair:
     case = validated(CaseFile, table, source=path)
-    left, right = (read_image(path.parent / name) for name in case.images)
-    if left.shape != right.shape:
-        raise InputError(
-            path, "images", f"must have the same size, but have {left.shape[1::-1]} and {right.shape[1::-1]}"
-        )
+    if len(case.images) != len(case.eyes):
+        raise InputError(path, "images", f"must be {len(case.eyes)} files (one per eye), not {len(case.images)}")
+    images = tuple(read_image(path.parent / name) for name in case.images)
+    left = images[0]
+    for image in images:
+        if image.shape != left.shape:
+            raise InputError(
+                path, "images", f"must have the same size, but have {left.shape[1::-1]} and {image.shape[1::-1]}"
+            )
     size = {"width_px": left.shape[1], "height_px": left.shape[0]}
     stack = validated(StackGeometry, size | case.panels, source=f"{path}: panels").stack()
     eyes = np.array(case.eyes)
@@ -105,7 +116,7 @@ def _case(path: Path, table: dict[str, Any]) -> StillPair:
         if image.shape != left.shape:
             raise InputError(path.parent / view.image, "", "must have the same size as the pair")
         off.append(OffView(view.mm, np.array(view.eye), image))
-    return StillPair(path.stem, stack, eyes, (left, right), case.fov, tuple(off))
+    return StillPair(path.stem, stack, eyes, images, case.fov, tuple(off))
 
 
 def eyes_at(*, distance_m: float, angle_deg: float = 0.0, height_m: float = 0.0, ipd_m: float = 0.063) -> F64:
