@@ -1,4 +1,4 @@
-"""Evaluate the layers of a still solution: compute retina images and quality, and write the result files."""
+"""Evaluate a still solution: compute retina images and quality, and write the result files."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class PairQuality:
 
 @dataclass(frozen=True)
 class SolvedPair:
-    """Layers for a set of pictures, one for each eye. The retina images and the quality are computed on first access.
+    """Layers for several eyes' pictures. The retina images and the quality are computed on first access.
 
     On first access, ValueError is raised if an eye is behind a panel or sees no part of the panels.
     """
