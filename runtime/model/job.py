@@ -100,7 +100,7 @@ class Job:
 
     @property
     def views(self) -> tuple[TargetView, ...]:
-        """What each eye should see."""
+        """Each eye's view."""
         return self.targets.views
 
     @property
