@@ -1,0 +1,292 @@
+"""Real panels against closed forms: Malus, Gooch and Tarry, Snell, moiré, slits, first-order response."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from runtime.optics.carried import expected_psnrs_db
+from runtime.optics.light import Sampling as Rays
+from runtime.optics.real.cells import (
+    BANDS_NM,
+    DESIGN_NM,
+    FIRST_MINIMUM,
+    Cell,
+    Kind,
+    crossed_intensity,
+    retarder,
+    rotator,
+    twisted_nematic,
+)
+from runtime.optics.real.light import Sampling, Sight, real_light
+from runtime.optics.real.panels import Lighting, Mounting, Optics, RealPanels, Timing
+from runtime.optics.real.trace import Tables, black_level, crossings, diffraction_orders, moments
+from runtime.optics.stack import PanelStack
+from runtime.records import F64, U8
+
+STACK = PanelStack(0.12, 0.09, (-0.03, 0.0, 0.03), 160, 120)
+EYES = np.array([[0.6, -0.0315, 0.02], [0.6, 0.0315, 0.02]])
+MIDDLE = np.array([[0.6, 0.0, 0.0]])
+CENTRE = np.zeros((1, 3))
+
+
+def random() -> np.random.Generator:
+    return np.random.default_rng(7)
+
+
+def smooth_layers(stack: PanelStack = STACK) -> U8:
+    noise = np.random.default_rng(3).random((stack.count, stack.height_px // 8, stack.width_px // 8, 3))
+    return np.asarray(np.rint(255 * noise.repeat(8, 1).repeat(8, 2)), np.uint8)
+
+
+def sight(sigma_mm: float = 1.0) -> Sight:
+    pictures = np.random.default_rng(5).random((2, 44, 68, 3)).astype(np.float32)
+    return Sight(EYES, (pictures[0], pictures[1]), 4.0, sigma_mm)
+
+
+def intensity(values: tuple[float, float, float], real: RealPanels) -> F64:
+    """(3,) light of a ray through panels that show these values everywhere."""
+    stack = replace(STACK, width_px=16, height_px=16)
+    layers = np.stack([np.full((16, 16, 3), round(255 * value), np.uint8) for value in values])
+    crossed = crossings(MIDDLE, CENTRE, stack, real, random())
+    return Tables(layers, stack, real).light(crossed, 0.6)[0][0].astype(np.float64)
+
+
+def test_ideal_panels_give_the_solvers_own_figure() -> None:
+    layers, seen = smooth_layers(), sight()
+    ours = real_light(layers, STACK, RealPanels(), seen, Sampling(rays=4)).light_db
+    at = {"eyes_m": EYES, "fov_deg": 4.0, "sigmas_mm": (1.0,)}
+    theirs = expected_psnrs_db(layers, seen.targets, STACK, sampling=Rays(rays=8), **at)[1.0]
+    assert ours == pytest.approx(theirs, abs=0.01)
+
+
+def test_jones_calculus_and_summed_angles_agree() -> None:
+    turned = real_light(smooth_layers(), STACK, RealPanels(), sight(), Sampling(step=2))
+    barely = RealPanels(cells=(Cell(retardance_nm=1e-6),))
+    assert real_light(smooth_layers(), STACK, barely, sight(), Sampling(step=2)).error == pytest.approx(turned.error)
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 20.0, 45.0, 77.0, 90.0, 130.0])
+def test_a_rotator_between_crossed_polarizers_follows_malus(angle_deg: float) -> None:
+    assert crossed_intensity(rotator(math.radians(angle_deg))) == pytest.approx(math.sin(math.radians(angle_deg)) ** 2)
+
+
+@pytest.mark.parametrize("u", [0.5, 1.0, FIRST_MINIMUM, 3.0, math.sqrt(15), 5.0])
+def test_a_twisted_cell_between_parallel_polarizers_follows_gooch_and_tarry(u: float) -> None:
+    cell = twisted_nematic(math.pi / 2, math.pi / 2 * u)
+    expected = math.sin(math.pi / 2 * math.sqrt(1 + u * u)) ** 2 / (1 + u * u)
+    assert abs(cell[0, 0]) ** 2 == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize("u", [math.sqrt(3), math.sqrt(15), math.sqrt(35)])
+def test_gooch_tarry_minima_are_pure_rotators(u: float) -> None:
+    cell = twisted_nematic(math.pi / 2, math.pi / 2 * u)
+    turned = cell @ rotator(-math.pi / 2)
+    assert np.abs(turned / turned[0, 0] - np.eye(2)).max() < 1e-12
+
+
+def test_mauguins_limit_guides_light_along_the_twist() -> None:
+    assert crossed_intensity(twisted_nematic(math.pi / 2, math.pi / 2 * 400)) > 0.99999
+
+
+@pytest.mark.parametrize("kind", ["rotator", "twisted-nematic", "half-wave"])
+def test_one_cell_alone_has_the_ideal_grey_curve_in_green(kind: Kind) -> None:
+    seen = crossed_intensity(Cell(kind).jones()[:, 1])
+    assert np.abs(seen - np.sin(np.linspace(0, math.pi / 2, len(seen))) ** 2).max() < 1e-4
+
+
+def test_cells_absorb_nothing() -> None:
+    matrices = Cell("twisted-nematic", retardance_nm=20, white_deg=80, mauguin=1.5).jones()
+    assert np.abs(matrices @ matrices.conj().swapaxes(-1, -2) - np.eye(2)).max() < 1e-12
+
+
+def test_half_wave_plates_turn_in_alternate_directions() -> None:
+    values = (0.2, 0.7, 0.4)
+    seen = intensity(values, RealPanels(cells=(Cell("half-wave"),)))[1]
+    shown = [round(255 * value) / 255 for value in values]
+    assert seen == pytest.approx(math.sin(math.pi / 2 * (shown[2] - shown[1] + shown[0])) ** 2, abs=1e-5)
+
+
+def test_inverting_the_middle_half_wave_plate_and_the_analyser_mends_the_sum() -> None:
+    plates = tuple(Cell("half-wave", inverted=n == 1) for n in range(3))
+    values = (0.2, 0.6, 0.4)
+    mended = intensity(values, RealPanels(cells=plates, analyser_deg=0.0))[1]
+    assert mended == pytest.approx(intensity(values, RealPanels())[1], abs=1e-5)
+
+
+def test_half_wave_plates_err_by_their_dispersion() -> None:
+    for band, wavelength_nm in enumerate(BANDS_NM):
+        expected = math.sin(math.pi / 2 * DESIGN_NM / wavelength_nm) ** 2  # at 45 degrees between crossed polarizers
+        assert crossed_intensity(Cell("half-wave").jones()[-1, band]) == pytest.approx(expected)
+
+
+def test_residual_retardance_leaks_as_a_wave_plate_does() -> None:
+    plate = RealPanels(cells=(Cell(), Cell(), Cell(retardance_nm=30.0, retardance_axis_deg=45.0)))
+    seen = intensity((0.0, 0.0, 0.0), plate)
+    assert seen == pytest.approx([math.sin(math.pi * 30.0 / nm) ** 2 for nm in BANDS_NM], abs=1e-6)
+
+
+def test_a_quarter_wave_plate_makes_circular_light() -> None:
+    assert crossed_intensity(retarder(math.pi / 2, math.pi / 4)) == pytest.approx(0.5)
+
+
+def test_full_white_and_black_set_the_range_of_angles() -> None:
+    cell = RealPanels(cells=(Cell(white_deg=80.0, black_deg=4.0), Cell(), Cell()))
+    assert intensity((1.0, 0.0, 0.0), cell)[0] == pytest.approx(math.sin(math.radians(80)) ** 2, abs=1e-6)
+    assert intensity((0.0, 0.0, 0.0), cell)[0] == pytest.approx(math.sin(math.radians(4)) ** 2, abs=1e-6)
+
+
+def test_a_gamma_error_bends_the_grey_curve() -> None:
+    seen = intensity((0.6, 0.0, 0.0), RealPanels(cells=(Cell(gamma_ratio=1.1), Cell(), Cell())))[0]
+    assert seen == pytest.approx(math.sin(math.pi / 2 * 0.6**1.1) ** 2, abs=1e-6)
+
+
+def test_six_bits_round_to_64_levels() -> None:
+    angles = Cell(bits=6).angles_rad()
+    assert len(np.unique(angles)) == 64
+
+
+def test_contrast_of_a_cell_and_of_polarizers_is_that_of_black_and_white() -> None:
+    assert black_level([Cell(contrast=500.0)], math.inf) == pytest.approx(1 / 500)
+    assert black_level([Cell()], 2000.0) == pytest.approx(1 / 2000)
+
+
+def test_three_cells_of_a_thousand_leave_a_third_of_it() -> None:
+    assert black_level([Cell(contrast=1000.0)] * 3, math.inf) == pytest.approx(3 / 1000, rel=0.01)
+
+
+def test_glass_shortens_the_gap_by_snells_law() -> None:
+    glass = RealPanels(optics=Optics(glass_mm=2.0, index=1.5))
+    slope = 0.6
+    start = np.array([[0.5, 0.0, 0.0]])
+    ideal = crossings(start, np.array([[0.0, 0.5 * slope, 0.0]]), STACK, RealPanels(), random())
+    real = crossings(start, np.array([[0.0, 0.5 * slope, 0.0]]), STACK, glass, random())
+    sine = math.sin(math.atan(slope)) / 1.5
+    gap_m = 0.026 * slope + 0.004 * math.tan(math.asin(sine))
+    pitch_m = STACK.width_m / STACK.width_px
+    assert (real.u[1] - real.u[2]) * pitch_m == pytest.approx(gap_m)
+    assert (ideal.u[1] - ideal.u[2]) * pitch_m == pytest.approx(0.03 * slope)
+
+
+def test_a_shifted_panel_shows_other_pixels() -> None:
+    moved = RealPanels(mounting=(Mounting(), Mounting(), Mounting(right_mm=1.5, up_mm=0.75)))
+    ideal, real = (crossings(MIDDLE, CENTRE, STACK, panels, random()) for panels in (RealPanels(), moved))
+    assert (real.u - ideal.u)[:, 0] == pytest.approx([0, 0, -2])
+    assert (real.v - ideal.v)[:, 0] == pytest.approx([0, 0, 1])
+
+
+def test_roll_scale_and_depth_move_pixels_as_geometry_says() -> None:
+    through = np.array([[0.0, 0.03, 0.01]])
+    real = RealPanels(mounting=(Mounting(roll_mrad=10, scale=1.01), Mounting(), Mounting(depth_mm=1.0)))
+    crossed = crossings(MIDDLE, through, STACK, real, random())
+    rear = np.array([0.03, 0.01]) * 0.63 / 0.6
+    turn = np.array([[math.cos(0.01), math.sin(0.01)], [-math.sin(0.01), math.cos(0.01)]])
+    local = turn @ rear / 1.01
+    assert crossed.u[0, 0] == pytest.approx((local[0] / 0.12 + 0.5) * 160)
+    assert crossed.v[0, 0] == pytest.approx((0.5 - local[1] / 0.09) * 120)
+    assert crossed.u[2, 0] == pytest.approx((0.03 * (0.6 - 0.031) / 0.6 / 0.12 + 0.5) * 160)
+
+
+def test_a_sloping_panel_is_met_where_its_plane_is() -> None:
+    through = np.array([[0.0, 0.03, 0.01]])
+    real = RealPanels(mounting=(Mounting(), Mounting(slope_right_mrad=50.0, slope_up_mrad=-20.0), Mounting()))
+    crossed = crossings(MIDDLE, through, STACK, real, random())
+    y, z = (crossed.u[1, 0] / 160 - 0.5) * 0.12, (0.5 - crossed.v[1, 0] / 120) * 0.09
+    x = 0.05 * y - 0.02 * z
+    assert (0.6 - x) / 0.6 == pytest.approx(y / 0.03) == pytest.approx(z / 0.01)
+
+
+def test_moire_has_the_period_of_two_pitches_seen_from_the_eye() -> None:
+    stack = PanelStack(0.12, 0.09, (-0.03, 0.0), 400, 300)
+    real = RealPanels(optics=Optics(filters=(False, False), aperture=0.25))
+    across = np.linspace(-0.04, 0.04, 40_000)
+    through = np.stack([np.zeros_like(across), across, np.full_like(across, 1.5e-4)], -1)
+    white = Tables(smooth_layers(stack), stack, real)._white(
+        crossings(MIDDLE.repeat(len(across), 0), through, stack, real, random())
+    )
+    spectrum = np.abs(np.fft.rfft((white[:, 0] - white.mean()) * np.hanning(len(across)), 1 << 20))
+    frequencies = np.fft.rfftfreq(1 << 20, across[1] - across[0])
+    low = (frequencies > 100) & (frequencies < 1000)  # below the subpixels' own frequency
+    found = frequencies[low][np.argmax(spectrum[low])]
+    stripe_m = 0.12 / 400 / 3
+    assert 1 / found == pytest.approx(stripe_m * 0.6 / 0.03, rel=0.02)  # pitch·distance/gap
+
+
+def test_colour_filters_pass_a_third_of_the_open_area_each() -> None:
+    real = RealPanels(optics=Optics(filters=(True, False, False), aperture=0.6))
+    seen = real_light(smooth_layers(), STACK, real, sight(0.0), Sampling(rays=8))
+    assert seen.brightness == pytest.approx(0.6**3 / 3, rel=0.05)
+
+
+def test_light_behind_a_slit_spreads_as_sinc_squared() -> None:
+    orders = diffraction_orders(random().random(400_000))
+    assert np.mean(np.abs(orders) < 1) == pytest.approx(0.9028 / 0.9833, abs=0.003)  # main lobe, of that within 6
+
+
+def test_haze_spreads_rays_by_its_angle_over_the_gap() -> None:
+    real = RealPanels(optics=Optics(haze=1.0, haze_deg=1.0))
+    rays = 20_000
+    crossed = crossings(np.repeat(MIDDLE, rays, 0), np.zeros((rays, 3)), STACK, real, random())
+    pitch_m = STACK.width_m / STACK.width_px
+    assert crossed.u[2].std() < 1e-9
+    assert crossed.u[1].std() * pitch_m == pytest.approx(0.03 * math.radians(1.0), rel=0.02)
+
+
+def test_reflections_shift_what_lies_behind_the_gap_by_twice_the_gap() -> None:
+    real = RealPanels(optics=Optics(reflectance=1.0))
+    through = np.array([[0.0, 0.02, 0.0]])
+    crossed = crossings(MIDDLE, through, STACK, real, random())
+    slope = -0.02 / 0.6
+    y = (crossed.u[:, 0] / 160 - 0.5) * 0.12
+    assert y[1] == pytest.approx(0.02 - slope * 0.06)
+    assert y[0] == pytest.approx(0.02 - slope * (0.03 + 0.12))
+
+
+def test_room_light_and_dark_corners_change_what_is_seen() -> None:
+    dark = real_light(smooth_layers(), STACK, RealPanels(), sight(0.0), Sampling(step=2)).error
+    lit = RealPanels(lighting=Lighting(room_lux=200))
+    assert lit.lighting.veil == pytest.approx(200 * 0.05 / math.pi / 9)
+    assert real_light(smooth_layers(), STACK, lit, sight(0.0), Sampling(step=2)).error != pytest.approx(dark, rel=1e-3)
+
+
+def test_a_slow_panel_shows_older_frames_as_an_exponential_does() -> None:
+    timing = Timing(response_ms=10.0, rate_hz=100.0)
+    for lags in moments(STACK, timing):
+        weights, newest = lags.of(2, np.array([0.5]))
+        assert newest[0] == 0
+        assert weights.sum() == pytest.approx(1)
+        assert weights[0, 0] == pytest.approx(1 - math.exp(-lags.moment))
+        assert weights[2, 0] / weights[1, 0] == pytest.approx(math.exp(-1))
+
+
+def test_a_late_panel_shows_the_previous_frame_for_its_delay() -> None:
+    timing = Timing(late_ms=(0.0, 0.0, 5.0), rate_hz=100.0)
+    ages = [lags.of(2, np.array([0.5]))[1][0] for lags in moments(STACK, timing)]
+    assert ages == [1, 1, 0, 0]
+
+
+def test_a_panel_mounted_upside_down_is_out_of_step_at_the_edges_only() -> None:
+    timing = Timing(scan=1.0, bottom_up=(False, False, True))
+    rows = np.array([0.01, 0.5, 0.99])
+    front = np.array([lags.of(2, rows)[1] for lags in moments(STACK, timing)]).mean(axis=0)
+    rear = np.array([lags.of(0, rows)[1] for lags in moments(STACK, timing)]).mean(axis=0)
+    assert front.tolist() == [1, 0, 0]
+    assert rear.tolist() == [0, 0, 1]
+
+
+def test_a_late_front_panel_costs_light_only_when_the_head_moves() -> None:
+    late, seen = Timing(late_ms=(0.0, 0.0, 12.0)), sight(0.0)
+    quality = [
+        real_light(smooth_layers(), STACK, RealPanels(timing=replace(late, head_m_s=v)), seen, Sampling(step=2)).error
+        for v in (0.0, 0.5)
+    ]
+    ideal = real_light(smooth_layers(), STACK, RealPanels(), seen, Sampling(step=2)).error
+    assert quality[0] == ideal != quality[1]
+
+
+def test_entries_that_do_not_fit_the_stack_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"panels\.cells: must have 1 or 3 entries, but has 2"):
+        real_light(smooth_layers(), STACK, RealPanels(cells=(Cell(), Cell())), sight(), Sampling())
