@@ -21,8 +21,8 @@ from runtime.optics.real.cells import (
     rotator,
     twisted_nematic,
 )
-from runtime.optics.real.light import Sampling, Sight, real_light
-from runtime.optics.real.panels import Lighting, Mounting, Optics, RealPanels, Timing
+from runtime.optics.real.light import RealSampling, Sight, real_light
+from runtime.optics.real.panels import Lighting, Optics, Placement, RealPanels, Timing
 from runtime.optics.real.trace import Tables, black_level, crossings, diffraction_orders, moments
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
@@ -57,16 +57,18 @@ def intensity(values: tuple[float, float, float], real: RealPanels) -> F64:
 
 def test_ideal_panels_give_the_solvers_own_figure() -> None:
     layers, seen = smooth_layers(), sight()
-    ours = real_light(layers, STACK, RealPanels(), seen, Sampling(rays=4)).light_db
+    ours = real_light(layers, STACK, RealPanels(), seen, RealSampling(rays=4)).light_db
     at = {"eyes_m": EYES, "fov_deg": 4.0, "sigmas_mm": (1.0,)}
     theirs = expected_psnrs_db(layers, seen.targets, STACK, sampling=Rays(rays=8), **at)[1.0]
     assert ours == pytest.approx(theirs, abs=0.01)
 
 
 def test_jones_calculus_and_summed_angles_agree() -> None:
-    turned = real_light(smooth_layers(), STACK, RealPanels(), sight(), Sampling(step=2))
+    turned = real_light(smooth_layers(), STACK, RealPanels(), sight(), RealSampling(step=2))
     barely = RealPanels(cells=(Cell(retardance_nm=1e-6),))
-    assert real_light(smooth_layers(), STACK, barely, sight(), Sampling(step=2)).error == pytest.approx(turned.error)
+    assert real_light(smooth_layers(), STACK, barely, sight(), RealSampling(step=2)).error == pytest.approx(
+        turned.error
+    )
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 20.0, 45.0, 77.0, 90.0, 130.0])
@@ -172,7 +174,7 @@ def test_glass_shortens_the_gap_by_snells_law() -> None:
 
 
 def test_a_shifted_panel_shows_other_pixels() -> None:
-    moved = RealPanels(mounting=(Mounting(), Mounting(), Mounting(right_mm=1.5, up_mm=0.75)))
+    moved = RealPanels(mounting=(Placement(), Placement(), Placement(right_mm=1.5, up_mm=0.75)))
     ideal, real = (crossings(MIDDLE, CENTRE, STACK, panels, random()) for panels in (RealPanels(), moved))
     assert (real.u - ideal.u)[:, 0] == pytest.approx([0, 0, -2])
     assert (real.v - ideal.v)[:, 0] == pytest.approx([0, 0, 1])
@@ -180,7 +182,7 @@ def test_a_shifted_panel_shows_other_pixels() -> None:
 
 def test_roll_scale_and_depth_move_pixels_as_geometry_says() -> None:
     through = np.array([[0.0, 0.03, 0.01]])
-    real = RealPanels(mounting=(Mounting(roll_mrad=10, scale=1.01), Mounting(), Mounting(depth_mm=1.0)))
+    real = RealPanels(mounting=(Placement(roll_mrad=10, scale=1.01), Placement(), Placement(depth_mm=1.0)))
     crossed = crossings(MIDDLE, through, STACK, real, random())
     rear = np.array([0.03, 0.01]) * 0.63 / 0.6
     turn = np.array([[math.cos(0.01), math.sin(0.01)], [-math.sin(0.01), math.cos(0.01)]])
@@ -192,7 +194,7 @@ def test_roll_scale_and_depth_move_pixels_as_geometry_says() -> None:
 
 def test_a_sloping_panel_is_met_where_its_plane_is() -> None:
     through = np.array([[0.0, 0.03, 0.01]])
-    real = RealPanels(mounting=(Mounting(), Mounting(slope_right_mrad=50.0, slope_up_mrad=-20.0), Mounting()))
+    real = RealPanels(mounting=(Placement(), Placement(slope_right_mrad=50.0, slope_up_mrad=-20.0), Placement()))
     crossed = crossings(MIDDLE, through, STACK, real, random())
     y, z = (crossed.u[1, 0] / 160 - 0.5) * 0.12, (0.5 - crossed.v[1, 0] / 120) * 0.09
     x = 0.05 * y - 0.02 * z
@@ -217,7 +219,7 @@ def test_moire_has_the_period_of_two_pitches_seen_from_the_eye() -> None:
 
 def test_colour_filters_pass_a_third_of_the_open_area_each() -> None:
     real = RealPanels(optics=Optics(filters=(True, False, False), aperture=0.6))
-    seen = real_light(smooth_layers(), STACK, real, sight(0.0), Sampling(rays=8))
+    seen = real_light(smooth_layers(), STACK, real, sight(0.0), RealSampling(rays=8))
     assert seen.brightness == pytest.approx(0.6**3 / 3, rel=0.05)
 
 
@@ -246,10 +248,12 @@ def test_reflections_shift_what_lies_behind_the_gap_by_twice_the_gap() -> None:
 
 
 def test_room_light_and_dark_corners_change_what_is_seen() -> None:
-    dark = real_light(smooth_layers(), STACK, RealPanels(), sight(0.0), Sampling(step=2)).error
+    dark = real_light(smooth_layers(), STACK, RealPanels(), sight(0.0), RealSampling(step=2)).error
     lit = RealPanels(lighting=Lighting(room_lux=200))
     assert lit.lighting.veil == pytest.approx(200 * 0.05 / math.pi / 9)
-    assert real_light(smooth_layers(), STACK, lit, sight(0.0), Sampling(step=2)).error != pytest.approx(dark, rel=1e-3)
+    assert real_light(smooth_layers(), STACK, lit, sight(0.0), RealSampling(step=2)).error != pytest.approx(
+        dark, rel=1e-3
+    )
 
 
 def test_a_slow_panel_shows_older_frames_as_an_exponential_does() -> None:
@@ -280,13 +284,15 @@ def test_a_panel_mounted_upside_down_is_out_of_step_at_the_edges_only() -> None:
 def test_a_late_front_panel_costs_light_only_when_the_head_moves() -> None:
     late, seen = Timing(late_ms=(0.0, 0.0, 12.0)), sight(0.0)
     quality = [
-        real_light(smooth_layers(), STACK, RealPanels(timing=replace(late, head_m_s=v)), seen, Sampling(step=2)).error
+        real_light(
+            smooth_layers(), STACK, RealPanels(timing=replace(late, head_m_s=v)), seen, RealSampling(step=2)
+        ).error
         for v in (0.0, 0.5)
     ]
-    ideal = real_light(smooth_layers(), STACK, RealPanels(), seen, Sampling(step=2)).error
+    ideal = real_light(smooth_layers(), STACK, RealPanels(), seen, RealSampling(step=2)).error
     assert quality[0] == ideal != quality[1]
 
 
 def test_entries_that_do_not_fit_the_stack_are_refused() -> None:
     with pytest.raises(ValueError, match=r"panels\.cells: must have 1 or 3 entries, but has 2"):
-        real_light(smooth_layers(), STACK, RealPanels(cells=(Cell(), Cell())), sight(), Sampling())
+        real_light(smooth_layers(), STACK, RealPanels(cells=(Cell(), Cell())), sight(), RealSampling())

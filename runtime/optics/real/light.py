@@ -24,7 +24,7 @@ SETS = 2  # independent sets of rays; the squared error is the product of their 
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """What two eyes should see, from where."""
+    """Targets for two eyes, and the eyes' positions."""
 
     eyes_m: F64  # (2, 3) eyes that the layers were solved for, frame `stack`
     targets: tuple[U8 | F32, ...]  # (h, w, 3) the left and right eyes' pictures
@@ -33,7 +33,7 @@ class Sight:
     seen_from_m: F64 | None = None  # (2, 3) true eyes; by default `eyes_m`
 
 
-class Sampling(NamedTuple):
+class RealSampling(NamedTuple):
     """Choice of the rays."""
 
     step: int = 1  # every `step`-th pixel of every `step`-th row
@@ -44,7 +44,7 @@ class Sampling(NamedTuple):
 
 
 class RealLight(NamedTuple):
-    """What reaches the eyes through real panels."""
+    """Light that reaches the eyes through real panels."""
 
     error: float  # mean squared error of the light, relative to full white as the eyes see it on average
     brightness: float  # full white's luminance, as a share of ideal panels'
@@ -55,7 +55,7 @@ class RealLight(NamedTuple):
         return psnr_db(self.error)
 
 
-def real_light(layers: U8, stack: PanelStack, real: RealPanels, sight: Sight, sampling: Sampling) -> RealLight:
+def real_light(layers: U8, stack: PanelStack, real: RealPanels, sight: Sight, sampling: RealSampling) -> RealLight:
     """Measure layers on real panels.
 
     Intensities are relative to full white, averaged over the picture in each band: eyes and cameras adapt to a darker
@@ -116,7 +116,7 @@ class _Eye(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _View:
-    """What an eye sees at the sampled pixels. Pixels that do not count have been left out."""
+    """Light that an eye sees at the sampled pixels. Pixels that do not count have been left out."""
 
     light: F32  # (sets, P, 3)
     white: F32  # (sets, P, 3) what it would see of white panels
@@ -130,7 +130,7 @@ class _View:
 
 
 def _view(
-    tables: Tables, eye: _Eye, sampling: Sampling, random: np.random.Generator, scattering: np.random.Generator
+    tables: Tables, eye: _Eye, sampling: RealSampling, random: np.random.Generator, scattering: np.random.Generator
 ) -> _View:
     stack, real = tables.stack, tables.real
     height, width = eye.target.shape[:2]

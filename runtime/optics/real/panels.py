@@ -12,7 +12,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
-class Mounting:
+class Placement:
     """Deviation of a panel from where the solver assumes it. Lengths refer to the liquid-crystal layer."""
 
     right_mm: float = 0.0  # shift to the viewer's right
@@ -26,7 +26,7 @@ class Mounting:
 
 @dataclass(frozen=True, slots=True)
 class Optics:
-    """What the panels do to a ray besides turning its polarization."""
+    """Effects of the panels on a ray, apart from turning its polarization."""
 
     glass_mm: float = 0.0  # thickness of the glass and films on each side of a panel's liquid-crystal layer
     index: float = 1.52  # refractive index of the glass (soda-lime and display glass at 540 nm)
@@ -81,7 +81,7 @@ class RealPanels:
     """A stack of real panels. Each of `cells` and `mounting` has one entry for all panels, or one for each."""
 
     cells: tuple[Cell, ...] = (Cell(),)
-    mounting: tuple[Mounting, ...] = (Mounting(),)
+    mounting: tuple[Placement, ...] = (Placement(),)
     optics: Optics = field(default_factory=Optics)
     lighting: Lighting = field(default_factory=Lighting)
     timing: Timing = field(default_factory=Timing)
@@ -91,7 +91,7 @@ class RealPanels:
         """Return a panel's cell. Panels are numbered from the rear."""
         return _of(self.cells, index)
 
-    def mounted(self, index: int) -> Mounting:
+    def mounted(self, index: int) -> Placement:
         """Return a panel's deviation from its assumed place."""
         return _of(self.mounting, index)
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.optics.real.cells import DESIGN_NM, STEPS, Cell, rotator
-from runtime.optics.real.panels import Mounting, RealPanels, Timing
+from runtime.optics.real.panels import Placement, RealPanels, Timing
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8
 
@@ -27,7 +27,7 @@ ORDERS = 6.0  # diffraction is drawn up to this many times the angle of a slit's
 
 @dataclass(frozen=True, slots=True)
 class Crossings:
-    """Where rays cross each panel, in the panel's pixels; each array has shape (N, P), panels from the rear."""
+    """Points where rays cross each panel, in the panel's pixels; each array has shape (N, P), panels from the rear."""
 
     u: F64
     v: F64
@@ -79,7 +79,7 @@ def _in_glass(right: F64, up: F64, distance_m: F64, glass_m: float, index: float
     return right * factor, up * factor
 
 
-def _cross(x: F64, y: F64, z: F64, right: F64, up: F64, plane_m: float, mounted: Mounting) -> tuple[F64, F64, F64]:
+def _cross(x: F64, y: F64, z: F64, right: F64, up: F64, plane_m: float, mounted: Placement) -> tuple[F64, F64, F64]:
     """Return where rays meet a panel's plane."""
     to_right, to_up = mounted.slope_right_mrad / 1e3, mounted.slope_up_mrad / 1e3
     if to_right == 0.0 and to_up == 0.0:
@@ -89,9 +89,9 @@ def _cross(x: F64, y: F64, z: F64, right: F64, up: F64, plane_m: float, mounted:
     return crossed, y + right * (crossed - x), z + up * (crossed - x)
 
 
-def _pixels(y: F64, z: F64, stack: PanelStack, mounted: Mounting) -> tuple[F64, F64]:
+def _pixels(y: F64, z: F64, stack: PanelStack, mounted: Placement) -> tuple[F64, F64]:
     """Return the pixel positions of points of a panel."""
-    if mounted != Mounting():
+    if mounted != Placement():
         y, z = y - mounted.right_mm / 1e3, z - mounted.up_mm / 1e3
         c, s = math.cos(mounted.roll_mrad / 1e3), math.sin(mounted.roll_mrad / 1e3)
         y, z = (c * y + s * z) / mounted.scale, (c * z - s * y) / mounted.scale
