@@ -29,7 +29,6 @@ SIZE_PX = {"width_px": 960, "height_px": 540}  # small by default, because small
 SCENE = "room"  # scene shown if there is no configuration file
 WEBCAM_FOV_DEG = 65.0  # typical of webcams; can be changed in a configuration file
 SLOW_PAGE_S = 2.0  # the page's camera counts as lost if no picture arrives for this long
-MEASURED_EVERY_S = 4.0  # interval for measuring the light at the eyes
 
 
 def settings_of(
@@ -44,8 +43,7 @@ def settings_of(
         )
         sensor["timeout_s"] = SLOW_PAGE_S
         settings = changed(settings, "sensor", sensor, source="try")
-    every = max(1, round(MEASURED_EVERY_S * settings.loop.rate_hz))
-    return changed(settings, "loop", {"evaluate_every": every}, source="try")
+    return settings
 
 
 def try_display(settings: Settings, *, port: int, opens: bool, seconds: float | None, as_json: bool) -> None:

@@ -225,6 +225,7 @@ def build_run(
         output=output,
         on_account=on_account,
         simulated=simulated,
+        newest=options.browser is not None,
     )
     pacer = Pacer(
         period_ns=panels.period_ns or round(NS_PER_S / settings.loop.rate_hz),

@@ -50,7 +50,7 @@ def holds(presenter: Presenter) -> dict[str, Any]:
     }
 
 
-def shown(presenter: Presenter, account: RefreshAccount, link: BrowserLink) -> dict[str, Any]:
+def shown(presenter: Presenter, account: RefreshAccount, link: BrowserLink, run: Run | None) -> dict[str, Any]:
     """Return the values from the latest refresh, for use by a page that displays the panels."""
     assert presenter.last is not None
     frame, solution = presenter.last.frame, presenter.last.solution
@@ -66,6 +66,7 @@ def shown(presenter: Presenter, account: RefreshAccount, link: BrowserLink) -> d
         "scene": presenter.run_cell.state.settings.content.scene,
         "model": presenter.run_cell.state.settings.model.name,
         "page_ms": link.page_ms_of(account.capture_ns),
+        **({} if run is None else run.observer.light(presenter.last)),
     }
 
 
@@ -95,7 +96,7 @@ def snapshot(run: Run, account: RefreshAccount) -> dict[str, Any]:
         # A solution computed for a time after this display time has no age yet.
         "solution_age_now_ms": None if account.solution_age_ms is None else max(0.0, account.solution_age_ms),
         "effort": account.effort,
-        "light_db": None if run.observer.moment is None else run.observer.moment.light_db,
+        **run.observer.light(presenter.last),
         **run.observer.live(),
         "view_error_estimated_now_mm": _view_error_now_mm(account),
         "photon_now_ms": (account.photon_ns - account.capture_ns) / NS_PER_MS if account.capture_ns else None,

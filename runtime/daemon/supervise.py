@@ -98,7 +98,7 @@ class Daemon(Host):
             self._server.publish(lambda: status.snapshot(run, account) | _news(loading, refused, recorder))
         if self._link is not None:
             self._link.moment = self.run.observer.moment if self.run is not None else None
-            self._link.refreshed(status.shown(presenter, account, self._link))
+            self._link.refreshed(status.shown(presenter, account, self._link, self.run))
 
     def watches(self, run: Run) -> None:
         self.run, self.changes = run, Changes(run.presenter)

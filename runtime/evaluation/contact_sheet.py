@@ -14,7 +14,7 @@ from runtime.evaluation.displayed import EyeViews, eye_names
 from runtime.optics.carried import intensities
 from runtime.optics.pupil import PUPIL_MM, TRACKING_SIGMA_MM
 from runtime.optics.retina import as_codes
-from runtime.records import F32, F64, U8
+from runtime.records import F32, F64, U8, RefreshAccount
 
 TILE_WIDTH = 640  # pixels
 MARGIN = 12  # pixels
@@ -40,6 +40,8 @@ class Moment:
     solved_for_m: F64  # (2, 3) eyes the solution was computed for, frame `stack`
     asked_for: tuple[U8, ...]  # (h, w, 3) the solution's targets
     relief: F32 | None = None  # (h, w) relief of the solution's content (`optics.relief`)
+    account: RefreshAccount | None = None  # the refresh
+    state_version: int = 0  # the run's state at the refresh (`RunState.version`)
 
 
 def contact_sheet(layers: U8, eye_views: EyeViews | None, *, headline: str, lines: Sequence[str] = ()) -> U8:

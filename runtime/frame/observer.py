@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from runtime.clock import NS_PER_S
 from runtime.evaluation.contact_sheet import Moment
 from runtime.frame.kept_light import KeptLight, Output
 from runtime.frame.presenter import Refresh
 from runtime.frame.refresh_lines import RefreshLines
-from runtime.frame.sampling import QualitySampler, has_picture
+from runtime.frame.sampling import QualitySampler, applies_to, has_picture
 from runtime.frame.targets import TargetDrawer
 from runtime.frame.truth import TrueEyes
 from runtime.optics.stack import PanelStack
@@ -32,6 +33,7 @@ class RunObserver:
         output: Output | None = None,
         on_account: Callable[[RefreshAccount], None] | None = None,
         simulated: bool = False,
+        newest: bool = False,
     ) -> None:
         """Create an observer for one run.
 
@@ -44,12 +46,15 @@ class RunObserver:
             output: Destination for the run's files. If None, no files are written.
             on_account: Function called with each refresh's account.
             simulated: True if the run's clock is simulated.
+            newest: Measure the newest refresh whenever its light is not known, instead of every `evaluate_every`-th.
         """
         self._measures, self._simulated, self._on_account = evaluate_every is not None, simulated, on_account
         self.last: Refresh | None = None
         self.truth = TrueEyes()
         self._lines = RefreshLines(self.truth, output.refresh if output is not None else None)
-        self._sampler = QualitySampler(stack, drawer, self.truth, every=evaluate_every or 0, simulated=simulated)
+        self._sampler = QualitySampler(
+            stack, drawer, self.truth, every=evaluate_every or 0, simulated=simulated, newest=newest
+        )
         self._kept = KeptLight(keep_light, output, drawer, self.truth, simulated=simulated) if output else None
 
     @property
@@ -108,6 +113,20 @@ class RunObserver:
     def live(self) -> dict[str, Any]:
         """Return the live quality measured so far, for the daemon's status (docs/contracts.md, Error)."""
         return {"live_db": self._sampler.live_db, "view_error_mm": self._lines.view_error_mm.of("p50", "p95")}
+
+    def light(self, refresh: Refresh | None) -> dict[str, Any]:
+        """Return the light measured for a refresh's eyes, content and model, for the daemon's status.
+
+        Returns:
+            `light_db`; `light_age_s`, the time since the measured refresh; `measured_frame`, that refresh's number. All
+            are None if the eyes, the content or the model have changed since.
+        """
+        moment = self._sampler.moment
+        if refresh is None or moment is None or moment.account is None or not applies_to(moment, refresh):
+            return dict.fromkeys(("light_db", "light_age_s", "measured_frame"))
+        age_s = round(max(0, refresh.account.photon_ns - moment.account.photon_ns) / NS_PER_S, 1)
+        light_db = round(moment.light_db, 2)
+        return {"light_db": light_db, "light_age_s": age_s, "measured_frame": moment.account.frame}
 
     def summary(self) -> dict[str, Any]:
         """Return the quality figures for summary.json. Any figure that was not measured is null."""

@@ -71,6 +71,7 @@ class Refresh:
     account: RefreshAccount
     frame: PanelFrame
     solution: Solution | None  # the latest solution at the time of this refresh
+    state_version: int = 0  # the run's state at this refresh (`RunState.version`)
 
 
 class Observer(Protocol):
@@ -405,7 +406,7 @@ class Presenter:
     def _report(
         self, account: RefreshAccount, frame: PanelFrame, solution: Solution | None, times: RefreshTimes
     ) -> None:
-        self.last = Refresh(account, frame, solution)
+        self.last = Refresh(account, frame, solution, self._adopted)
         self._supervisor.refreshed(self, account)
         self.stats.add(account, overhead_ms=times.overhead_ms(), missed_blanks=self.pacer.missed)
         for observer in self._observers:

@@ -4,7 +4,8 @@ The target pictures are drawn on the solver's thread. In real time, a background
 layers at a time, starting with the newest refresh. It works during only a small share of the run, because measuring
 must not slow down the solutions being measured. If refreshes come due while a measurement is running, a few of them are
 queued and measured after the run, and the others are dropped. On a simulated clock, every refresh that is due is
-measured, in order.
+measured, in order. For a page that shows the display live, the newest refresh is measured whenever its figure is out of
+date.
 """
 
 from __future__ import annotations
@@ -27,14 +28,17 @@ from runtime.optics.alignment import shown_layers
 from runtime.optics.quality import psnr_db
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, State
-from runtime.support.background import MEASURING_NICENESS, BackgroundJob
+from runtime.support.background import BACKGROUND_NICENESS, MEASURING_NICENESS, BackgroundJob
 
 HELD_MAX = 5  # maximum number of refreshes queued in real time
 HELD_BYTES = 200 << 20  # limit for the queued refreshes' layers; a refresh takes 25 MB at 1080p on the full raster
 MEASURING_SHARE = 0.1  # largest share of a real-time run spent on measuring
+LIVE_SHARE = 0.3  # the same for a live page, whose measurements take a third of the time
 MEASURED_WITHIN_S = 60.0  # timeout for measuring the queued refreshes after the run
 LOOK_S = 0.02  # interval for checking whether the queue is done
 DRAWN_WITHIN_S = 10.0  # timeout for drawing the last refresh's target pictures
+MOVED_M = 0.002  # a figure applies until an eye has moved this far, about twice a tracker's error
+REST_S = 0.3  # how long the eyes must rest before a live page's refresh is measured again
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +50,8 @@ class _Sample:
 class QualitySampler:
     """Measures the quality of every `every`-th refresh and, if `finish` is called, of the last one.
 
-    If `every` is 0, only the last refresh is measured.
+    If `every` is 0, only the last refresh is measured. If `newest` is true, light is instead measured at the newest
+    refresh whenever the eyes, the content or the model have changed since the last measurement.
     """
 
     def __init__(
@@ -57,9 +62,13 @@ class QualitySampler:
         *,
         every: int,
         simulated: bool,
+        newest: bool = False,
     ) -> None:
         self._stack, self._drawer, self._truth = stack, drawer, truth
-        self._every, self._simulated = every, simulated
+        self._every, self._simulated, self._newest = every, simulated, newest
+        self._rests_at: F64 | None = None  # (2, 3) the eyes since `_rests_since_s`, to within `MOVED_M`
+        self._rests_since_s = 0.0
+        self._tried: Refresh | None = None  # latest refresh to be measured
         self.only_live = False  # if True, only live quality is measured
         self.measured: dict[str, list[float]] = {}  # values for each sampled refresh, keyed by name in FIGURES
         self.live: dict[int, float] = {}  # mean squared error of the light at the true eyes, by refresh number
@@ -76,6 +85,9 @@ class QualitySampler:
 
         In real time, if the queue is then too large, earlier refreshes are dropped from it.
         """
+        if self._newest:
+            self._replace_waiting(refresh)
+            return
         is_sample = self._every and refresh.account.frame % self._every == self._every - 1
         if not is_sample or not refresh.account.presented:
             return
@@ -83,6 +95,22 @@ class QualitySampler:
         self._waiting.append(_Sample(refresh, self._drawer.shown_content()))
         while not self._simulated and len(self._waiting) > 1 and self._holds_too_much():
             del self._waiting[self._samples % (len(self._waiting) - 1)]
+
+    def _replace_waiting(self, refresh: Refresh) -> None:
+        """Make `refresh` the only one in the queue if its figure is out of date and the eyes rest, or else empty it."""
+        self._waiting.clear()
+        account, solution, now_s = refresh.account, refresh.solution, time.monotonic()
+        if not is_measurable(refresh) or account.eyes_m is None or solution is None:
+            return
+        if self._rests_at is None or np.abs(account.eyes_m - self._rests_at).max() > MOVED_M:
+            self._rests_at, self._rests_since_s = account.eyes_m, now_s
+        measured = None if self.moment is None or not applies_to(self.moment, refresh) else self.moment.account
+        if measured is not None and measured.solution == solution.number:
+            return
+        if self._tried is None or not _is_alike(self._tried, refresh):
+            self._resumes_s = 0.0
+        if now_s - self._rests_since_s >= REST_S:
+            self._waiting.append(_Sample(refresh, self._drawer.shown_content()))
 
     def _holds_too_much(self) -> bool:
         layers = [sample.refresh.solution.layers for sample in self._waiting if sample.refresh.solution is not None]
@@ -118,11 +146,12 @@ class QualitySampler:
             return
         while self._waiting and self._job is None and not self._drawing:
             first = 0 if self._simulated else -1
-            if self._truth.may_come(self._waiting[first].refresh.account.photon_ns):
+            if not self._newest and self._truth.may_come(self._waiting[first].refresh.account.photon_ns):
                 return
             sample = self._waiting[first]
             del self._waiting[first]
             self._began_s = now_s
+            self._tried = sample.refresh
             self._begin(sample)
 
     def _collect(self) -> None:
@@ -130,7 +159,8 @@ class QualitySampler:
             job, self._job = self._job, None
             self._take(self._job_frame, job.take())
             now_s = time.monotonic()
-            self._resumes_s = now_s + (now_s - self._began_s) * (1 / MEASURING_SHARE - 1)
+            share = LIVE_SHARE if self._newest else MEASURING_SHARE
+            self._resumes_s = now_s + (now_s - self._began_s) * (1 / share - 1)
 
     def finish(self, last: Refresh) -> None:
         """Measure the run's last refresh.
@@ -150,7 +180,7 @@ class QualitySampler:
 
     def _begin(self, sample: _Sample) -> None:
         refresh, frame = sample.refresh, sample.refresh.account.frame
-        true_m = self._truth.at(refresh.account.photon_ns)
+        true_m = None if self._newest else self._truth.at(refresh.account.photon_ns)
         wanted = self._wanted(refresh, true_m)
         if not wanted:
             return
@@ -160,8 +190,9 @@ class QualitySampler:
                 self._take(frame, self._compared(refresh, true_m, targets))
             elif targets is not None:
                 self._job_frame = frame
+                niceness = BACKGROUND_NICENESS if self._newest else MEASURING_NICENESS
                 self._job = BackgroundJob(
-                    "quality", lambda: self._compared(refresh, true_m, targets), niceness=MEASURING_NICENESS
+                    "quality", lambda: self._compared(refresh, true_m, targets), niceness=niceness
                 )
             self._drawing = False
 
@@ -176,8 +207,9 @@ class QualitySampler:
             wanted["true"] = true_m, account.photon_ns
         if self.only_live:
             return wanted
-        is_tracked = account.state is State.TRACKING and has_picture(refresh) and account.eyes_m is not None
-        if is_tracked and solution is not None and solution.solved_for_m is not None and account.eyes_m is not None:
+        if solution is None or solution.solved_for_m is None or account.eyes_m is None:
+            return wanted
+        if is_measurable(refresh):
             wanted["solved"] = solution.solved_for_m, solution.solved_for_ns
             wanted["used"] = account.eyes_m, solution.solved_for_ns
         return wanted
@@ -190,9 +222,17 @@ class QualitySampler:
         if targets.used is not None:
             aligned = replace(frame, parallax=None)
             carried = shown_layers(aligned), shown_layers(replace(aligned, solved_from_shown=()))
-        quality = measure_refresh(account, shown_layers(frame), carried, targets, self._stack)
-        moment = quality.moment
-        return quality if moment is None else replace(quality, moment=replace(moment, relief=frame.relief))
+        layers = shown_layers(frame)
+        quality = measure_refresh(account, layers, carried, targets, self._stack, quick=self._newest)
+        if quality.moment is None:
+            return quality
+        moment = replace(
+            quality.moment,
+            relief=frame.relief,
+            account=account,
+            state_version=refresh.state_version,
+        )
+        return replace(quality, moment=moment)
 
     def _take(self, frame: int, quality: RefreshQuality | None, *, figures: bool = True, live: bool = True) -> None:
         if quality is None:
@@ -227,4 +267,41 @@ def has_picture(refresh: Refresh) -> bool:
         and solution is not None
         and solution.solved_for_m is not None
         and solution.seeing == (True, True)
+    )
+
+
+def is_measurable(refresh: Refresh) -> bool:
+    """Return True if light can be measured at the aligned eyes: a viewer is tracked, and the content is not stale."""
+    solution = refresh.solution
+    return (
+        refresh.account.state is State.TRACKING
+        and refresh.account.eyes_m is not None
+        and has_picture(refresh)
+        and solution is not None
+        and solution.state_version == refresh.state_version
+    )
+
+
+def applies_to(moment: Moment, refresh: Refresh) -> bool:
+    """Return True if a measurement holds for a refresh: same content, model and placement, and the eyes at rest."""
+    account = moment.account
+    return (
+        account is not None
+        and is_measurable(refresh)
+        and _alike((moment.state_version, account.eyes_m), (refresh.state_version, refresh.account.eyes_m))
+    )
+
+
+def _is_alike(before: Refresh, now: Refresh) -> bool:
+    return _alike((before.state_version, before.account.eyes_m), (now.state_version, now.account.eyes_m))
+
+
+def _alike(one: tuple[int, F64 | None], other: tuple[int, F64 | None]) -> bool:
+    """Return True if two refreshes belong to the same run state and their eyes (2, 3) are within `MOVED_M`."""
+    (version, eyes_m), (other_version, other_m) = one, other
+    return (
+        version == other_version
+        and eyes_m is not None
+        and other_m is not None
+        and bool(np.abs(eyes_m - other_m).max() <= MOVED_M)
     )

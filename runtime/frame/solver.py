@@ -175,6 +175,7 @@ class Solver:
             effort=effort,
             measures=self._meter.measure(job, prediction.layers, effort, time_ns=request.time_ns),
             relief=job.relief,
+            state_version=state.version,
         )
         return SolverUpdate(solution=solution)
 

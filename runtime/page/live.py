@@ -125,7 +125,8 @@ class _Page:
         data = await asyncio.to_thread(packed)
         height, width = views.wanted[0].shape[:2]
         size = [moment.layers.shape[2], moment.layers.shape[1]]
-        await self._say({"layers": "solved", "solved_for_m": views.eyes_m, "size": size, "target": [width, height]})
+        message = {"layers": "solved", "solved_for_m": views.eyes_m, "size": size, "target": [width, height]}
+        await self._say(message | {"frame": moment.account.frame})
         await self._socket.send_bytes(data)
 
     async def receive(self, me: object) -> None:

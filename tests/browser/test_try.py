@@ -29,11 +29,13 @@ from tests.waiting import eventually
 SMALL = '[stack]\nwidth_px = 320\nheight_px = 180\n[model]\nname = "fast"\nbackend = "cpu"\n'
 TRIED = (
     "the token is not in the address", "the pointer moved the head", "status has the eyes there to 1 mm",
-    "another solution", "and the page shows it", "the picture is one", "figures are told",
-    "what was asked for is shown", "and the newest again", "the solver is held", "an old status does not undo it",
-    "while alignment goes on", "eyes lost: flat", "and back", "a scene that is not there", "another scene",
-    "another page looks on", "and takes over", "nobody: held, then flat", "back: tracking", "another gap",
-    "its camera is the sensor", "and the pointer again", "and the scene stays",
+    "another solution", "and the page shows it", "the picture is one", "figures are told", "light has a figure",
+    "a moved head has no old figure", "and then its own", "the status and the page agree",
+    "what was asked for is shown", "for this head", "another head has another target", "and the newest again",
+    "the solver is held", "an old status does not undo it", "while alignment goes on", "eyes lost: flat", "and back",
+    "a scene that is not there", "another scene", "another page looks on", "and takes over",
+    "nobody: held, then flat", "back: tracking", "another gap", "its camera is the sensor", "and the pointer again",
+    "and the scene stays",
 )  # fmt: skip
 
 

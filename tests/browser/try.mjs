@@ -41,13 +41,23 @@ say("the picture is one", size > 5000);
 say("figures are told", await until(async () => /[\d.]+ refreshes per second/.test(await page.textContent(".figures"))));
 await page.screenshot({ path: `${folder}/try.png` });
 
+const light = () => page.textContent(".light");
+say("light has a figure", await until(async () => /\d dB/.test(await light())));
+await page.mouse.move(260, 200);
+say("a moved head has no old figure", await until(async () => !/\d dB/.test(await light()), 5000));
+say("and then its own", await until(async () => /\d dB/.test(await light())));
+say("the status and the page agree", await until(async () => (await light()).includes(`${(await status()).light_db?.toFixed(1)} dB`)));
 await page.click("[data-mode=target]");
 say("what was asked for is shown", await until(() => page.evaluate(() => / dB against/.test(document.querySelector(".light").textContent))));
 await page.screenshot({ path: `${folder}/target.png` });
+say("for this head", await until(async () => (await page.textContent(".head")) === "Measured for this position of the head."));
+await page.mouse.move(400, 120);
+say("another head has another target", await until(() => page.evaluate(() => !document.querySelector(".notice").hidden), 5000)
+  && await until(async () => (await page.textContent(".head")) === "Measured for this position of the head."));
 await page.click("[data-mode=left]");
 const solved = (await status()).solution;
 await page.mouse.move(220, 160);
-say("and the newest again", await until(async () => (await status()).solution > solved && await page.evaluate(() => document.querySelector(".light").textContent === "")));
+say("and the newest again", await until(async () => (await status()).solution > solved && /is where/.test(await page.textContent(".head"))));
 
 // A status from before the click that comes after it does not undo it.
 let asked, release;

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from dataclasses import replace
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ from runtime.records import PanelFrame, RefreshAccount, SensorFrame, Solution, S
 from runtime.support.background import wait_for_all
 from tests.frame.conftest import SMALL
 from tests.frame.fakes import EYES, FakeSolver, aside
+from tests.waiting import eventually
 
 PERIOD_NS = 20 * NS_PER_MS
 FOV_DEG = 40.0
@@ -437,6 +439,49 @@ def test_a_reload_draws_the_new_scene_in_its_field_of_view(content: ContentSourc
     assert list(observer.live_errors) == [2]
     assert (kept.lights[1]["true"], kept.lights[1]["drawn"]) == (None, None)
     assert kept.lights[2]["true"] is not None
+
+
+def test_a_live_figure_applies_to_these_eyes_and_this_state_alone(content: ContentSource, solved: Solution) -> None:
+    observer, _ = looking(content, simulated=False, newest=True)
+    numbers = count(1)
+
+    def light(shown: Refresh) -> float | None:
+        observer.refreshed(shown)
+        return observer.light(shown)["light_db"]
+
+    def measured(eyes_m: Any, state: int, solution: Solution) -> bool:
+        return eventually(
+            lambda: light(replace(refresh(next(numbers), solution, eyes_m=eyes_m), state_version=state)) is not None
+        )
+
+    assert measured(EYES, 0, solved)
+    moved = replace(refresh(next(numbers), solved, eyes_m=aside(0.02)), state_version=0)
+    assert light(moved) is None, "the figure of another position"
+    assert measured(aside(0.02), 0, solved)
+    stale = replace(refresh(next(numbers), solved, eyes_m=aside(0.02)), state_version=1)
+    assert light(stale) is None, "the scene or the model has changed, and the panels still show the old solution"
+    assert observer.light(stale)["light_age_s"] is None
+    assert measured(aside(0.02), 1, replace(solved, number=2, state_version=1))
+    assert light(moved) is None
+
+
+def test_a_live_figure_has_an_age_and_follows_a_better_solution(content: ContentSource, solved: Solution) -> None:
+    observer, _ = looking(content, simulated=False, newest=True)
+    numbers = count(1)
+
+    def frame_measured(solution: Solution) -> int | None:
+        shown = refresh(next(numbers), solution)
+        observer.refreshed(shown)
+        return observer.light(shown)["measured_frame"]
+
+    assert eventually(lambda: frame_measured(solved) is not None)
+    first = frame_measured(solved)
+    later = refresh(next(numbers) + 100, solved)
+    assert first is not None
+    age_s = (later.account.frame - first) * PERIOD_NS / NS_PER_S
+    assert observer.light(later)["light_age_s"] == pytest.approx(age_s, abs=0.06)
+    better = replace(solved, number=2)
+    assert eventually(lambda: frame_measured(better) != first)
 
 
 # --- kept light --------------------------------------------------------------------------------------------------

@@ -104,6 +104,14 @@ say("moved at once", (await statusIs((s) => Math.abs(s.placing.offset_m[1] - 0.0
   (await until(async () => (await page.textContent("#placed")).includes("place: done"))));
 await page.fill("#p-turntable", "6");
 say("turntable", await statusIs((s) => s.placing.turntable_per_min === 6 && Math.abs(s.placing.offset_m[1] - 0.06) < 1e-9));
+const scales = [];
+for (const scale of ["2", "0.5", "1.5", "1.2345"]) {
+  await page.fill("#p-scale", scale);
+  scales.push(await statusIs((s) => s.placing.scale === Number(scale)));
+}
+say("any scale", scales.every(Boolean));
+await page.fill("#p-scale", "1001");
+say("a scale out of range", await shows("#placed", "Scale: must be a number from 0.001 to 1000") && (await now()).placing.scale === 1.2345);
 await page.click("#place-reset");
 say("as configured", await statusIs((s) => s.placing.turntable_per_min === 0 && s.placing.offset_m[1] === 0));
 await page.fill("#model", "sart");

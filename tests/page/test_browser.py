@@ -27,7 +27,8 @@ CONTROLS = (
     "state is shown", "pictures are shown", "pause", "resume", "flat", "resume by the keyboard", "reload", "scene",
     "a scene that is not there", "scene back", "black box", "it says that the daemon is gone",
     "it says that the daemon hangs", "it goes on when it hangs no more",
-    "moved at once", "turntable", "as configured", "another model", "the model back", "a playlist", "the next one",
+    "moved at once", "turntable", "any scale", "a scale out of range", "as configured",
+    "another model", "the model back", "a playlist", "the next one",
     "from a playlist to a scene", "a wish without a daemon is refused",
     "it goes on when it is back", "and without the old refusal", "fits 1280", "fits 390",
 )  # fmt: skip

@@ -27,7 +27,8 @@ const CONTROLS = `
 let look = null, socket = null, viewer = false, sensor = true, lastSent = 0, follows = null, ipd_m = 0.063, newest = null, pending = null;
 let checks = false, camera = null, lookedAt = null;
 // wishes: number of commands in progress. answered_ms: when the last command ended.
-let layersSeen = { solved: false, flat: false }, first = null, wishes = 0, answered_ms = 0;
+// measured: number of the measured refresh whose target pictures are loaded.
+let layersSeen = { solved: false, flat: false }, first = null, wishes = 0, answered_ms = 0, measured = null;
 const latencies = [], drawn = [];
 const main = document.querySelector("main");
 
@@ -101,6 +102,7 @@ function build({ stack, fov_deg }) {
   const title = stack.x_m.length > 2 ? `${stack.x_m.length} panels, live` : "two panels, live";
   const picture = { width: stack.width_px, height: stack.height_px };
   look = new Look(main, { stack, fov_deg, picture, eyes_m: null }, { title, eyesAt: eyesNow, onTheWay: head });
+  look.live = true;
   look.onhead = follow;
   look.onmode = check;
   main.querySelector(".more").innerHTML = CONTROLS;
@@ -128,8 +130,8 @@ function build({ stack, fov_deg }) {
 function check(on) {
   if (on === checks) return;
   checks = on;
+  measured = null;
   for (const side of [0, 1]) look.display.target(side, null);
-  main.querySelector(".light").textContent = "";
   look.notice(on ? "Measuring the current picture …" : "");
   say({ checks });
 }
@@ -200,9 +202,26 @@ function take({ refresh, viewer: mine }) {
   const flatness = checks ? 0 : layersSeen.solved ? (layersSeen.flat ? refresh.flatness : 0) : 1;
   const same = before && look.flatness === flatness && JSON.stringify(before.eyes_m) === JSON.stringify(refresh.eyes_m);
   look.flatness = flatness;
-  look.state = refresh.state === "tracking" ? "" : explained(refresh);
-  if (!same || before.state !== refresh.state) look.draw();
+  const state = refresh.state === "tracking" ? (checks ? age(refresh) : "") : explained(refresh), told = state === look.state;
+  look.state = state;
+  light(refresh);
+  if (!same || !told) look.draw();
   if (layersSeen.solved && flatness < 1) first?.();
+}
+
+// Show the light that the daemon has measured for these eyes, this content and this model. Until it has, show no figure.
+function light({ state, light_db, light_age_s }) {
+  const known = typeof light_db === "number", old = light_age_s >= 2 ? `, measured ${light_age_s.toFixed(0)} s ago` : "";
+  if (known) look.tell(light_db, old);
+  else main.querySelector(".light").textContent = state === "tracking" && layersSeen.solved ? "Light at both eyes: not measured yet for this picture." : "";
+}
+
+// What the target pictures belong to. Older ones stay until the current refresh has been measured.
+function age({ measured_frame }) {
+  if (measured === null) return "";
+  const current = measured_frame === measured;
+  look.notice(current ? "" : "This was measured before the last change. Measuring again …");
+  return current ? "Measured for this position of the head." : "Measured before the head, the scene or the model changed.";
 }
 
 // A message that explains why the picture differs from what the two eyes should see.
@@ -215,7 +234,7 @@ function explained({ state, reason }) {
 }
 
 function load(bytes) {
-  const { layers: kind, solved_for_m, target, relief, size: [w, h] } = pending, size = 4 * w * h * look.stack.x_m.length;
+  const { layers: kind, solved_for_m, target, relief, frame, size: [w, h] } = pending, size = 4 * w * h * look.stack.x_m.length;
   look.display.load(kind, new Uint8Array(bytes, 0, size), [w, h]);
   if (kind === "solved") look.display.unfold(relief ? new Uint16Array(bytes, size, relief[0] * relief[1]) : null, relief);
   if (target) {
@@ -224,6 +243,7 @@ function load(bytes) {
     for (const side of [0, 1])
       look.display.target(side, new ImageData(new Uint8ClampedArray(bytes, size + side * length, length), width, height));
   }
+  if (target) measured = frame;
   layersSeen[kind] = true;
   if (kind === "solved" && (target || !checks)) look.notice("");
   if (kind === "solved") look.scene.eyes_m = solved_for_m ?? look.scene.eyes_m;
@@ -240,6 +260,7 @@ function connect() {
     if (message.layers) pending = message;
     else if (message.stack) {
       layersSeen = { solved: false, flat: false };
+      measured = null;
       sensor = message.is_sensor;
       const same = look && ["width_px", "height_px"].every((k) => look.stack[k] === message.stack[k]) && look.stack.x_m.length === message.stack.x_m.length;
       if (same) look.turnTo(message.stack), look.notice("Solving the first picture …");
@@ -290,7 +311,6 @@ function figures(now, asked_ms) {
     "uncertainty of the eyes": typeof now.eye_sigma_now_mm === "number" && `${number(now.eye_sigma_now_mm, 2)} mm (${now.eyes_label})`,
     "delay between pointer and picture": latencies.length > 20 && `${number(at(0.5), 0)} ms median, 99% within ${number(at(0.99), 0)} ms`,
     ...(now.program ? { "drawing program": now.missing?.content ?? (now.program.frame_ms > 0 && `${number(now.program.frame_ms, 0)} ms per frame`), "program's address": now.program.address } : {}),
-    "light at the eyes": typeof now.light_db === "number" && `${number(now.light_db)} dB`,
   };
   main.querySelector(".figures")?.replaceChildren(...Object.entries(rows).filter(([, text]) => text).flatMap(([name, text]) =>
     [["dt", name], ["dd", text]].map(([kind, textContent]) => Object.assign(document.createElement(kind), { textContent }))));

@@ -233,7 +233,12 @@ async function sendPlacing() {
 
 for (const [id, name, part, units] of PLACE) {
   $(id).addEventListener("input", () => {
-    if (!placed || $(id).value === "" || !$(id).checkValidity()) return;
+    if (!placed || $(id).validity.valueMissing || ($(id).value === "" && $(id).validity.valid)) return;
+    if (!$(id).checkValidity()) {
+      const { min, max, labels: [{ textContent: label }] } = $(id);
+      $("placed").dataset.kind = "bad";
+      return setText($("placed"), `${label}: must be a number from ${min} to ${max}`);
+    }
     const value = Number($(id).value) / units;
     const before = (waiting ?? {})[name] ?? placed[name];
     const next = part === null ? value : before.map((v, k) => (k === part ? value : v));
