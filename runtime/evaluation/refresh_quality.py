@@ -22,7 +22,7 @@ log = logging.getLogger("phasestack.quality")
 # How light is sampled. A displaced view has its errors at edges, so if only a quarter of a small picture's pixels are
 # sampled, the measured live quality is off by 0.6 dB.
 ALIGNED, LIVE = Sampling(step=2), Sampling(rays=4)
-QUICK = Sampling(step=4)  # within 0.1 dB of `ALIGNED` in a third of the time, for figures shown while a run goes on
+QUICK = Sampling(step=4)  # within 0.1 dB of `ALIGNED` in a third of the time, for a live page
 ALIGNED_LARGE, LIVE_LARGE = Sampling(step=4), Sampling(step=2)  # for pictures with more values than `PLENTY`
 FIGURES = ("light_db", "psnr_db", "ssim", "carried_db", "psnr_db_true_eyes", "carried_db_true_eyes")
 Pictures = tuple[U8, U8]  # (h, w, 3) pictures for the left and right eyes, at a panel's resolution
