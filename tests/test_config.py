@@ -27,6 +27,7 @@ PANEL = '[[output.panels]]\nconnector = "DP-{}"\n'
     [
         ("[stack]\nwidth_m = 518.4", "stack.width_m", "for 518.4 millimetres, write 0.5184"),
         ("[stack]\nx_m = [-60, 0, 60]", "stack.x_m.0", "for -60 millimetres, write -0.06"),
+        ("[stack]\nx_m = [-6, 0, 6]", "stack.x_m", "did you mean [-0.06, 0, 0.06]?"),
         ("[stack]\nx_m = [0.0, 1e-9, 0.06]", "stack.x_m", "apart, but the minimum is"),
         ("[stack]\nwidth_m = 1e-30", "stack.width_m", "out of range; use 0.005 to 20 m"),
         ("[stack]\nwidth_m = 1e308", "stack.width_m", "out of range; use 0.005 to 20 m"),

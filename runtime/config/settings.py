@@ -19,6 +19,7 @@ from runtime.support.sections import Section
 MOST = 1e9  # limit for numbers that have no narrower range
 PIXEL_ASPECT_TOLERANCE = 0.03  # relative; data sheets give a rounded size for the active area
 LEAST_GAP_M = 1e-5  # minimum distance between panels; real panels are all thicker
+DEPTH_MOST = 10.0  # maximum distance from the rear to the front panel, relative to the longer side of a panel
 PANELS_MOST = 8  # maximum number of panels in a stack
 
 NonNegative = Annotated[float, Field(ge=0, le=MOST)]
@@ -85,6 +86,13 @@ class StackGeometry(Section):
             raise ValueError("x_m: must increase from rear to front")
         if min(gaps) < LEAST_GAP_M:
             raise ValueError(f"x_m: two panels are only {min(gaps):g} m apart, but the minimum is {LEAST_GAP_M:g} m")
+        depth_m, side_m = self.x_m[-1] - self.x_m[0], max(self.width_m, self.height_m)
+        if depth_m > DEPTH_MOST * side_m:
+            meant = ", ".join(f"{x_m / 100:g}" for x_m in self.x_m)  # as if given in centimetres
+            raise ValueError(
+                f"x_m: the stack is {depth_m:g} m deep, but its panels are only {self.width_m:g} x {self.height_m:g} m; "
+                f"did you mean [{meant}]?"
+            )
         return self
 
     def check_pixels(self) -> None:

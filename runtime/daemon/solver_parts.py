@@ -8,8 +8,6 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import numpy as np
-
 from runtime.config import ContentSettings, Settings
 from runtime.content.base import ContentSource
 from runtime.content.registry import Opener, prepare_content
@@ -18,7 +16,8 @@ from runtime.eyes.calibration import Calibration
 from runtime.frame.effort import Costs, simulated_costs
 from runtime.frame.run_state import RunCell, RunState
 from runtime.frame.solver import Solver, SolverUpdate
-from runtime.model.backends import EYES_M, Choice, Wanted, choose
+from runtime.model.backends import Choice, Wanted, choose
+from runtime.model.base import trial_eyes_m
 from runtime.model.predictor import Predictor, load_predictor
 from runtime.optics.stack import PanelStack
 from runtime.records import SolveRequest
@@ -88,9 +87,10 @@ class RunningSolver:
     def _trial_costs(self, predictor: Predictor, *, time_ns: int) -> Mapping[int, Mapping[str, float]]:
         """Return each raster's shortest stage times. If the content cannot be drawn yet, return those of warm-up."""
         costs: dict[int, dict[str, float]] = {}
+        eyes_m = trial_eyes_m(predictor.stack)
         try:
             for reduction in predictor.reductions:
-                eyes_m, count = np.array(EYES_M), TRIALS[reduction > 1]
+                count = TRIALS[reduction > 1]
                 runs = [self.solver.trial_ms(eyes_m, reduction, time_ns=time_ns) for _ in range(count)]
                 costs[reduction] = {stage: min(run.get(stage, 0.0) for run in runs) for stage in runs[0]}
         except ContextLost:
@@ -207,7 +207,7 @@ def ready_predictor(settings: Settings, stack: PanelStack) -> Predictor:
     """
     predictor = load_predictor(settings.model.name, stack, settings.model)
     try:
-        predictor.warm_up(np.array(EYES_M))
+        predictor.warm_up(trial_eyes_m(stack))
     except BaseException:
         predictor.close()
         raise

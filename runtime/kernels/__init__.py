@@ -136,6 +136,14 @@ COMPILED = {
 }  # fmt: skip
 
 
+def _raise_failure(status: int, function: Any, arguments: tuple[Any, ...]) -> None:
+    """Raise MemoryError or ValueError if a compiled function returned a status that is not 0."""
+    if status == 2:
+        raise MemoryError("no memory for a solution's rays")
+    if status:
+        raise ValueError(f"the compiled function {function.__name__} cannot use its arguments (sizes, or a homography)")
+
+
 @cache
 def library() -> Any:
     """Return the compiled library. Raises ImportError if it is missing or built from another version."""
@@ -157,6 +165,8 @@ def library() -> Any:
         if function is None:
             raise other
         function.argtypes, function.restype = arguments, None
+    for name in ("step", "close_middle", "warp", "squared_error"):
+        getattr(loops, name).restype, getattr(loops, name).errcheck = _int, _raise_failure
     short = ctypes.PyDLL(str(built))  # keeps the GIL, because the presenter could wait for it longer than it takes
     loops.frame_picture = short.frame_picture
     loops.frame_picture.argtypes = [_pointer, _long, _long, _int, _int, _pointer, _int, _int, _pointer]

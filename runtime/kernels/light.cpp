@@ -71,8 +71,9 @@ INLINE bool see(const View &view, double u, double v, int point, float *seen) {
 }  // namespace
 
 // Sum the products of the two ray sets' errors over every step-th row from `first` to `end` - 1, and count the terms.
-FOR_EVERY_CPU void squared_error(const View *given, int first, int end, Result *result) {
+FOR_EVERY_CPU int32_t squared_error(const View *given, int first, int end, Result *result) {
   const View &view = *given;
+  if (view.step < 1 || view.rays < 0 || view.rays > 1024 || view.points < 1 || first < 0 || end > view.rows) return UNUSABLE;
   const int in_set = std::max(view.rays * view.rays, 1), sets = view.rays ? 2 : 1, side = std::max(view.rays, 1);
   double total = 0;
   int64_t counted = 0;
@@ -100,6 +101,7 @@ FOR_EVERY_CPU void squared_error(const View *given, int first, int end, Result *
       counted += 3;
     }
   *result = {total, counted};
+  return DONE;
 }
 
 extern "C" { extern const int32_t view_bytes = sizeof(View); }

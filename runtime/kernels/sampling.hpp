@@ -6,8 +6,9 @@
 #include <cstdint>
 #include <cstring>
 
-// Exported functions, and the functions inlined into them, are compiled for three processor levels.
-#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
+// Exported functions, and the functions inlined into them, are compiled for three processor levels, or with ONE_LEVEL
+// only for that of the compiler's options.
+#if !defined(ONE_LEVEL) && defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
 #define FOR_EVERY_CPU extern "C" __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
 #else
 #define FOR_EVERY_CPU extern "C"
@@ -33,6 +34,13 @@ struct Image {
   int32_t rows, width, ring;  // row r is stored at index r % ring
   const int16_t *row(int r) const { return data + int64_t(r % ring) * stride; }
 };
+
+constexpr int32_t DONE = 0, UNUSABLE = 1, NO_MEMORY = 2;  // what exported functions return
+
+// Return true if homographies are finite, and small enough for products of a few entries and pixels to be finite.
+inline bool usable(const double *homographies, int64_t count) {
+  return std::all_of(homographies, homographies + count * 9, [](double entry) { return std::abs(entry) < 1e30; });
+}
 
 struct Ramp {  // each element's pixel index, for images with one or three channels
   int16_t one_channel[LANES + MAX_CHANNELS] = {}, three_channels[LANES + MAX_CHANNELS] = {};
@@ -113,16 +121,35 @@ struct Stretch {
   int s0, elements;       // first image column to read, and number of elements to read from there
 };
 
+// Return a value limited to a range. For NaN, return the lower limit.
+INLINE double limited(double value, double low, double high) { return value > low ? (value < high ? value : high) : low; }
+
 template <int C, typename AnyLine>
 INLINE Stretch stretch_of(const Image &image, const AnyLine &line, int first, int last) {
-  const double xs = line.x(first), xe = line.x(last - 1);
+  // The limits only matter where rounding has moved a pixel near the horizon out of the image.
+  const auto x_of = [&](int u) { return limited(line.x(u), -EDGE_PX, image.width + EDGE_PX - 1.01); };
+  const auto y_of = [&](int u) { return limited(line.y(u), -EDGE_PX, image.rows + EDGE_PX - 1.01); };
+  const double xs = x_of(first), xe = x_of(last - 1), left = std::min(xs, xe), right = std::max(xs, xe);
   const int steps = last - 1 - first;
   const auto whole_px = [](double px) { return std::abs(px - std::nearbyint(px)) < 1e-6; };
   const bool on_pixels = xs >= 0 && xe < image.width && whole_px(xs) && std::abs(xe - xs - steps) < 1e-6 &&
                          std::abs(line.x(first + 0.5 * steps) - xs - 0.5 * steps) < 1e-6;
-  const int s0 = on_pixels ? int(std::nearbyint(xs)) : std::clamp(int(std::floor(xs)) - 1, 0, image.width - 1) / LANES * LANES;
-  const int s1 = std::clamp(int(std::floor(xe)) + 2, 0, image.width - 1);
-  return {xs, xe, line.y(first), line.y(last - 1), first, steps, on_pixels, s0, std::min((s1 - s0 + 1) * C, SOURCE - 4 * LANES)};
+  const int s0 = on_pixels ? int(std::nearbyint(xs)) : std::clamp(int(std::floor(left)) - 1, 0, image.width - 1) / LANES * LANES;
+  const int s1 = std::clamp(int(std::floor(right)) + 2, 0, image.width - 1);
+  return {xs, xe, y_of(first), y_of(last - 1), first, steps, on_pixels, s0, (s1 - s0 + 1) * C};
+}
+
+// Return true if `mix_rows` and `mix_neighbours` can sample a stretch: its columns fit in the buffer, its rows do not run
+// steeply, and positions between its ends lie between those of the ends. A single pixel always fits.
+template <typename AnyLine>
+INLINE bool fits(const AnyLine &line, const Stretch &along) {
+  if (along.steps == 0) return true;
+  const double across = along.xe - along.xs, down = std::abs(along.ye - along.ys), half = 0.5 * along.steps;
+  if (along.elements > SOURCE - 4 * LANES) return false;
+  if (!(down <= 0.5 || (std::abs(across) > 0.5 && down <= 2 * std::abs(across)))) return false;
+  if (along.steps == 1) return true;
+  const double sag = line.x(along.first + half) - 0.5 * (along.xs + along.xe);  // of the parabola, at its middle
+  return std::abs(sag) < 0.25 || 4 * std::abs(sag) <= std::abs(across);
 }
 
 // Interpolate between the image rows above and below a stretch, and store the result for image f in to[f]. The stretch
@@ -131,7 +158,7 @@ template <int F, int C>
 INLINE void mix_rows(const Image *images, const Stretch &along, int16_t *const (&to)[F]) {
   const Image &image = images[0];
   const int16_t *ramp = C == 1 ? RAMP.one_channel : RAMP.three_channels;
-  const double slope = along.xe - along.xs > 0.5 ? (along.ye - along.ys) / (along.xe - along.xs) : 0, bottom = image.rows - 1;
+  const double slope = std::abs(along.xe - along.xs) > 0.5 ? (along.ye - along.ys) / (along.xe - along.xs) : 0, bottom = image.rows - 1;
   for (int at = 0, length; at < along.elements; at += length) {
     const double y = along.ys + (along.s0 + at / C - along.xs) * slope, within = std::clamp(y, 0.0, bottom);
     const int row = std::min(int(within), std::max(image.rows - 2, 0));
@@ -231,13 +258,17 @@ INLINE void mix_neighbours(const Parabola &by, int elements, const int16_t *cons
 // a vector and two pixels after the last sample may be overwritten, but nothing before the first.
 template <int F, int C, typename AnyLine>
 INLINE void sample(const Image *images, const AnyLine &line, int first, int last, Work &work, int16_t (*out)[TILE], int begin_at = 0) {
-  const Stretch along = stretch_of<C>(images[0], line, first, last);
-  int16_t *mixes[F], *to[F];  // if pixels coincide with columns, rows are interpolated directly into the output
-  for (int f = 0; f < F; ++f) to[f] = out[f] + begin_at, mixes[f] = along.on_pixels ? to[f] : work.source[f] + LANES;
-  mix_rows<F, C>(images, along, mixes);
-  if (along.on_pixels) return;
-  for (int f = 0; f < F; ++f) clamp_ends<C>(mixes[f], along.elements);
-  mix_neighbours<F, C>(parabola_of<C>(line, along), (along.steps + 1) * C, mixes, to);
+  for (int end; first < last; begin_at += (end - first) * C, first = end) {
+    end = last;
+    Stretch along = stretch_of<C>(images[0], line, first, end);
+    while (!fits(line, along)) end -= (end - first) / 2, along = stretch_of<C>(images[0], line, first, end);
+    int16_t *mixes[F], *to[F];  // if pixels coincide with columns, rows are interpolated directly into the output
+    for (int f = 0; f < F; ++f) to[f] = out[f] + begin_at, mixes[f] = along.on_pixels ? to[f] : work.source[f] + LANES;
+    mix_rows<F, C>(images, along, mixes);
+    if (along.on_pixels) continue;
+    for (int f = 0; f < F; ++f) clamp_ends<C>(mixes[f], along.elements);
+    mix_neighbours<F, C>(parabola_of<C>(line, along), (along.steps + 1) * C, mixes, to);
+  }
 }
 
 // Return the tile length for a line, in pixels. It is short enough to keep the parabola's error below 0.01 pixel and to
@@ -248,5 +279,5 @@ INLINE int tile_px(const Line &line, Span span) {
   const double scale = std::max(std::abs(line.xu - line.wu * (line.x(span.first) + 0.5)),
                                 std::abs(line.xu - line.wu * (line.x(span.last) + 0.5))) / nearest;
   const double bent = std::cbrt(0.2 / (turn * turn * std::max(scale, 1.0))), wide = scale > 1.8 ? 1.8 / scale : 1;
-  return std::max(4, int(std::min(bent, TILE_PX * wide)));
+  return int(limited(std::min(bent, TILE_PX * wide), 4, TILE_PX));  // `sample` divides tiles further if it must
 }

@@ -3,6 +3,7 @@
 // Rays are processed row by row, and their residuals are stored in a ring buffer of rows. A panel row is updated once
 // all the rays that cross it have been processed. Its phasors are kept in another ring buffer, from the first ray that
 // needs them to the last. Only the panels are read from and written to main memory.
+#include <stdexcept>
 #include <vector>
 
 #include "sampling.hpp"
@@ -44,6 +45,17 @@ struct Problem {
   }
 };
 
+// Return true if the arguments describe a problem that the loops can solve.
+bool solvable(const Problem &problem, int part, int parts) {
+  if (problem.panels < 2 || problem.panels > MAX_PANELS || problem.sets < 2 || problem.sets > MAX_SETS) return false;
+  if (problem.sets % 2 || (problem.channels != 1 && problem.channels != 3)) return false;
+  if (problem.height < 1 || problem.width < 1 || part < 0 || part >= parts) return false;
+  for (int n = 0; n < problem.panels; ++n)
+    if (problem.panel[n].ahead.rows < 1 || problem.panel[n].ahead.width < 1) return false;
+  const int64_t count = problem.sets * problem.panels;
+  return usable(problem.panels_from_rays, count) && usable(problem.rays_from_panels, count);
+}
+
 // The part of the work done by one thread: rows of rays, and the panel rows that can be updated once they are done.
 struct Share {
   int first, end;  // rows of rays
@@ -68,11 +80,13 @@ struct Range {
 // Return the range of ray rows, over all sets, that cross row q in panel n.
 Range rays_through(const Problem &problem, int n, int q) {
   const double right = problem.panel[n].ahead.width - 0.5;
-  Range rays{1e9, -1e9};
+  constexpr double everywhere = 1e9, horizon = 1e-6;
+  Range rays{everywhere, -everywhere};
   for (int set = 0; set < problem.sets; ++set) {
     const Line line(problem.rays_from_panels + (set * problem.panels + n) * 9, q);
+    if (!(std::min(line.w0 - 0.5 * line.wu, line.w0 + right * line.wu) > horizon)) return {-everywhere, everywhere};
     const double top = line.y(-0.5), bottom = line.y(right), run = std::abs(line.x(right) - line.x(-0.5));
-    const double margin = 2 * std::abs(bottom - top) / std::max(run, 1.0);  // extends the line by two pixels
+    const double margin = 2 * std::abs(bottom - top) / std::max(run, 0.5);  // extends the line by two pixels
     rays.low = std::min({rays.low, top - margin, bottom - margin});
     rays.high = std::max({rays.high, top + margin, bottom + margin});
   }
@@ -396,26 +410,38 @@ INLINE void close_rows(const Problem &problem, const Share &share) {
 }  // namespace
 
 // Run part number `part` of a step divided into `parts` independent parts.
-FOR_EVERY_CPU void step(const Problem *problem, int part, int parts) {
-  const Share share = share_of(*problem, part, parts, true);
-  switch (problem->channels * 10 + problem->panels) {
-    case 12: return step_rows<1, 2>(*problem, share);
-    case 13: return step_rows<1, 3>(*problem, share);
-    case 14: return step_rows<1, 4>(*problem, share);
-    case 15: return step_rows<1, 5>(*problem, share);
-    case 32: return step_rows<3, 2>(*problem, share);
-    case 33: return step_rows<3, 3>(*problem, share);
-    case 34: return step_rows<3, 4>(*problem, share);
-    case 35: return step_rows<3, 5>(*problem, share);
+FOR_EVERY_CPU int32_t step(const Problem *problem, int part, int parts) {
+  if (!solvable(*problem, part, parts)) return UNUSABLE;
+  try {
+    const Share share = share_of(*problem, part, parts, true);
+    switch (problem->channels * 10 + problem->panels) {
+      case 12: step_rows<1, 2>(*problem, share); break;
+      case 13: step_rows<1, 3>(*problem, share); break;
+      case 14: step_rows<1, 4>(*problem, share); break;
+      case 15: step_rows<1, 5>(*problem, share); break;
+      case 32: step_rows<3, 2>(*problem, share); break;
+      case 33: step_rows<3, 3>(*problem, share); break;
+      case 34: step_rows<3, 4>(*problem, share); break;
+      case 35: step_rows<3, 5>(*problem, share); break;
+    }
+    return DONE;
+  } catch (const std::exception &) {  // bad_alloc or length_error
+    return NO_MEMORY;
   }
 }
 
 // Solve the middle panel (`last`) with the other panels held fixed. The work is divided into `parts` independent parts,
 // and this call does part number `part`.
-FOR_EVERY_CPU void close_middle(const Problem *problem, int part, int parts) {
-  const Share share = share_of(*problem, part, parts, false);
-  if (problem->channels == 3) close_rows<3>(*problem, share);
-  else close_rows<1>(*problem, share);
+FOR_EVERY_CPU int32_t close_middle(const Problem *problem, int part, int parts) {
+  if (!solvable(*problem, part, parts)) return UNUSABLE;
+  try {
+    const Share share = share_of(*problem, part, parts, false);
+    if (problem->channels == 3) close_rows<3>(*problem, share);
+    else close_rows<1>(*problem, share);
+    return DONE;
+  } catch (const std::exception &) {
+    return NO_MEMORY;
+  }
 }
 
 // Convert a panel's rows from `first` to `end` - 1 to opaque RGBA pixels with 8-bit codes.

@@ -40,7 +40,7 @@ INLINE Span reaches(const WarpedLine &at, int count, const Image &image, double 
   at_least_zero(below * line.wu - line.yu, below * line.w0 - line.y0, low, high);
   if (!(high >= low)) return {0, 0};
   const double first = at.raster.from(low + 0.5) - 0.5, last = at.raster.from(high + 0.5) - 0.5;
-  const Span span{std::max(int(std::ceil(first - 1e-6)), 0), std::min(int(std::floor(last + 1e-6)) + 1, count)};
+  const Span span{int(limited(std::ceil(first - 1e-6), 0, count)), int(limited(std::floor(last + 1e-6) + 1, 0, count))};
   return span.first < span.last ? span : Span{0, 0};
 }
 
@@ -70,9 +70,14 @@ INLINE void warp_rows(const Image &image, const Image &result, const Warp &warp,
 
 // Sample the result's rows bilinearly from an image whose elements are within ±8191. Result pixels outside the image
 // are set to `outside`.
-FOR_EVERY_CPU void warp(const Image *image, const Image *result, const Warp *by, int channels, int outside, int first, int end) {
+FOR_EVERY_CPU int32_t warp(const Image *image, const Image *result, const Warp *by, int channels, int outside, int first, int end) {
+  const double law[] = {by->image.bend, by->image.middle, by->raster.bend, by->raster.middle};
+  if (!usable(by->image_from_raster, 1) || !std::all_of(law, law + 4, [](double x) { return std::abs(x) < 1e9; })) return UNUSABLE;
+  if ((channels != 1 && channels != 3) || image->rows < 1 || image->width < 1 || result->width < 0) return UNUSABLE;
+  if (first < 0 || end > result->rows || !(by->reach_px >= -1e9 && by->reach_px <= EDGE_PX - 1)) return UNUSABLE;
   if (channels == 3) warp_rows<3>(*image, *result, *by, outside, first, end);
   else warp_rows<1>(*image, *result, *by, outside, first, end);
+  return DONE;
 }
 
 extern "C" { extern const int32_t warp_bytes = sizeof(Warp); }

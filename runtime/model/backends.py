@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from runtime.errors import PhasestackError
-from runtime.model.base import Predictor
+from runtime.model.base import Predictor, trial_eyes_m
 from runtime.model.job import drawn_job
 from runtime.optics.stack import PanelStack
 from runtime.records import U8
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("phasestack.model")
 
-EYES_M = ((0.6, -0.031, 0.0), (0.6, 0.031, 0.0))
 FIRST_SHARE = 4  # the first comparison divides the panels' columns and rows by this
 CLEAR = 2.5  # a backend that is this many times as fast in the first comparison wins without a second one
 RUNS = 3  # timed runs; the fastest counts
@@ -110,7 +109,7 @@ def solution_ms(predictor: Predictor, stack: PanelStack, backend: SolverBackend,
     assert solver is not None
     solver.set_backend(backend)
     # Assume that the eyes are known exactly, because a tracking error adds the same time on every backend.
-    job = replace(drawn_job([_noise(stack, seed) for seed in (0, 1)], np.array(EYES_M), stack), eye_sigma_m=0.0)
+    job = replace(drawn_job([_noise(stack, seed) for seed in (0, 1)], trial_eyes_m(stack), stack), eye_sigma_m=0.0)
     try:
         solver.solve(job)
         times = []

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from runtime.clock import Stopwatch
 from runtime.model.job import Job, Savings, grey_job
 from runtime.optics.stack import PanelStack
@@ -18,6 +20,16 @@ if TYPE_CHECKING:
 
 
 STAGES = ("prepare", "inference", "finish", "step")  # inference: only the network; step: all panel updates
+
+
+TRIAL_M, TRIAL_ROOM_M = 0.6, 0.5  # the eyes' minimum distances from the origin and from the front panel
+TRIAL_HALF_M = 0.031  # half the distance between the eyes
+
+
+def trial_eyes_m(stack: PanelStack) -> F64:
+    """Return the (2, 3) eyes in frame `stack` for warm-up and timing, a usual distance in front of all panels."""
+    distance_m = max(TRIAL_M, max(stack.x_m) + TRIAL_ROOM_M)
+    return np.array([[distance_m, -TRIAL_HALF_M, 0.0], [distance_m, TRIAL_HALF_M, 0.0]])
 
 
 @dataclass(frozen=True, slots=True)

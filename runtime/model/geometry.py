@@ -31,6 +31,9 @@ SNAPPED = 1e-6  # a homography this close to a whole-pixel translation is treate
 # Weight given to a ray that misses a panel. The other eye's ray through the same pixel may cross all panels, so
 # reducing the weight gains 2 dB in two out of 12 pairs.
 MISSING_WEIGHT = 1 / 8
+# Head positions assumed by a step differ from the tracked one by at most this, because a person's head cannot be less
+# certain, and by at most this share of the eyes' distance from the front panel.
+SIGMA_MOST_M, SIGMA_MOST_SHARE = 0.1, 1 / 2
 KNOWN_PX = 1 / 8  # tracking errors are ignored if they move an outer panel's picture by less than this
 TAPERED_SHARE = 1 / 6  # rays fade in over this share of a window's taper; these rays correct the error at its edge
 PLACES: dict[Places, tuple[tuple[float, float], ...]] = {  # head positions (right, up) in standard deviations
@@ -99,12 +102,14 @@ class Geometry:
 
         Args:
             places: Head positions assumed by the step.
-            eye_sigma_m: Standard deviation of the tracking error.
+            eye_sigma_m: Standard deviation of the tracking error. It is limited so that all assumed eyes are in front
+                of the panels.
 
         Returns:
             (P·V, N, 3, 3) homographies. The first axis lists all eyes for each head position in turn.
         """
         right, up = stack_from_eye(self.eyes_m.mean(axis=0))[:3, 0], np.array([0.0, 0.0, 1.0])
+        eye_sigma_m = self._possible_m(eye_sigma_m)
         sure = self.rays.height_px == 1 or self._moved_px(eye_sigma_m) < KNOWN_PX
         positions = PLACES["middle" if sure else places]
         turns, homographies = len(positions), []
@@ -120,6 +125,11 @@ class Geometry:
                 seen = np.stack(between) @ from_rays @ rows
                 homographies.append(seen / (seen[:, 2] @ centre)[:, None, None])
         return np.array(homographies)
+
+    def _possible_m(self, eye_sigma_m: float) -> float:
+        """Return a standard deviation limited to what a person's head and the panels leave room for."""
+        room_m = SIGMA_MOST_SHARE * max(float(self.eyes_m[:, 0].min()) - max(self.stack.x_m), 0.0)
+        return min(eye_sigma_m, SIGMA_MOST_M, room_m)
 
     def _moved_px(self, eye_sigma_m: float) -> float:
         """Return the largest shift in any panel's picture, in pixels, if the eyes move by `eye_sigma_m`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
@@ -52,3 +53,6 @@ def fresh_threads() -> None:
 def _pool(threads: int) -> ThreadPoolExecutor:
     """Return the thread pool. Starting a thread takes 2 ms, so the pool is kept between calls."""
     return ThreadPoolExecutor(threads, "parallel-map")
+
+
+os.register_at_fork(after_in_child=fresh_threads)  # a forked process has none of the pool's threads

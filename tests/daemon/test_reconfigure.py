@@ -171,6 +171,14 @@ def test_costs_are_calibrated_with_the_scene_once_for_each_model(bench: Bench) -
     assert after is not first and set(after) == set(bench.state.predictor.reductions)
 
 
+def test_a_stack_that_reaches_past_the_usual_eyes_is_warmed_up() -> None:
+    """With assumed eyes between its panels, the process ended."""
+    large = settings(stack={"x_m": (-1.0, 0.0, 1.0)})
+    predictor = ready_predictor(large, large.stack.stack())
+    assert all(stages["step"] > 0 for stages in predictor.warmed_ms.values())
+    predictor.close()
+
+
 def test_content_that_cannot_be_drawn_yet_leaves_the_costs_of_warm_up(bench: Bench) -> None:
     def missing(*_: Any, **__: Any) -> Any:
         raise ContentFailure("no program is connected")

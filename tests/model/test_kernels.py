@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import re
+import resource
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,7 +20,10 @@ from runtime.errors import MissingPart
 from runtime.model import cpu
 from runtime.model.buffers import LayerPool
 from runtime.model.contract import Step
+from runtime.model.geometry import TargetView
+from runtime.model.job import Job, Targets
 from runtime.model.predictor import load_predictor
+from runtime.model.warp import warp
 from tests.model.scenes import eyes
 from tests.model.test_steps import STACK, STACKS, begun, panels_of
 
@@ -92,6 +98,112 @@ def test_whatever_the_loops_read_in_whole_vectors_has_a_margin(channels: int, ow
     for array in (*state._targets, state._tapers[0]):
         assert array.flags.c_contiguous
         assert array.base is not None and array.base.size >= array.size + kernels.MARGIN
+
+
+TURNS = {
+    "mirrored": (lambda picture: picture[:, ::-1], [[-1.0, 0.0, 480.0], [0.0, 1.0, 0.0]]),
+    "upside down": (lambda picture: picture[::-1], [[1.0, 0.0, 0.0], [0.0, -1.0, 270.0]]),
+    "on its side": (lambda picture: picture.swapaxes(0, 1), [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]),
+}
+
+
+@pytest.mark.parametrize("turn", TURNS)
+@pytest.mark.parametrize("channels", [1, 3])
+def test_rays_in_any_order_make_the_same_panels(turn: str, channels: int) -> None:
+    """A picture whose rows run left, up or down had the loops write in front of their buffers."""
+    turned, matrix = TURNS[turn]
+    made = []
+    for change in (None, np.array([*matrix, [0.0, 0.0, 1.0]])):
+        _, job, _ = begun(STACK, eyes(0.5, 0.05), own=False, channels=channels)
+        if change is not None:
+            left, right = (
+                TargetView(np.ascontiguousarray(turned(view.pixels)), view.plane_from_picture @ change)
+                for view in job.views
+            )
+            job = replace(job, targets=replace(job.targets, views=(left, right)))
+        state, geometry = cpu.CpuState(STACK, threads=2), job.targets.visible
+        state.begin(job, geometry)
+        state.close_middle()
+        state.start()
+        state.step(Step(size=1.0, places="middle"))
+        made.append(np.concatenate([panel.ravel() for panel in panels_of(state, geometry, channels)]))
+    off = np.abs(made[1] - made[0])
+    assert off.mean() < 1.5 and np.quantile(off, 0.99) < 8, (off.mean(), np.quantile(off, [0.9, 0.99]))
+
+
+@pytest.mark.parametrize("sigma_m", [0.03, 1.66, float("inf")])
+def test_an_uncertain_eye_stays_in_front_of_the_panels(sigma_m: float) -> None:
+    """A standard deviation of 30 mm at 2 cm from the front panel ended the process."""
+    near = np.array([[0.08, 0.065, 0.002], [0.08, 0.126, 0.015]])
+    _, job, geometry = begun(STACK, near, own=False)
+    for places in ("rising", "falling"):
+        weights = geometry.panels_from_rays(places, sigma_m)[:, :, 2] @ np.array([240.0, 60.0, 1.0])
+        np.testing.assert_allclose(weights, 1.0)
+        scales = geometry.panels_from_rays(places, sigma_m)[:, :, 0, 0]
+        assert (scales > 0).all() and np.isfinite(scales).all()
+    layers = load_predictor("sart" if sigma_m > 1 else "fast", STACK).solve(replace(job, eye_sigma_m=sigma_m)).layers
+    assert layers.std() > 1
+
+
+def test_an_eye_between_the_panels_ends_no_process() -> None:
+    for distance_m in (0.03, 0.0600001, -0.03, -0.1):
+        state, _, _ = begun(STACK, eyes(distance_m), own=False)
+        try:
+            state.close_middle()
+            state.step(Step(size=1.0, places="rising"))
+        except ValueError as refused:
+            assert "homography" in str(refused)
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, 1e300])
+def test_homographies_that_are_not_finite_are_refused(wrong: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The compiler had removed the loops' guards, and NaN became row -2147483648."""
+    state, _, geometry = begun(STACK, eyes(0.6), own=False)
+    matrices = geometry.panels_from_rays("middle", 0.0)
+    matrices[1, 2, 0, 1] = wrong
+    monkeypatch.setattr(type(geometry), "panels_from_rays", lambda *_: matrices)
+    monkeypatch.setattr(cpu, "inverse", lambda _: np.nan_to_num(matrices))
+    with pytest.raises(ValueError, match="homography"):
+        state.step(Step(size=1.0, places="middle"))
+    with pytest.raises(ValueError, match="homography"), np.errstate(invalid="ignore"):
+        warp(np.zeros((9, 9), np.int16), np.diag([1.0, wrong, 1.0]), size=(9, 9), outside=0)
+
+
+@pytest.mark.parametrize("scale", [60.0, 300.0, 5000.0])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_a_ray_may_span_any_number_of_pixels(scale: float, channels: int) -> None:
+    """Beyond 180, the loops read what they had not filled."""
+    image = np.random.default_rng(0).integers(0, 4081, (3, 60000, channels)).astype(np.int16)
+    matrix = np.array([[scale, 0, 0.25], [0, 1, 0], [0, 0, 1]])
+    found = warp(image[..., 0] if channels == 1 else image, matrix, size=(3, int(60000 / scale)), outside=0)
+    at = (np.arange(found.shape[1]) + 0.5) * scale + 0.25 - 0.5
+    left = np.clip(at.astype(int), 0, 59998)
+    share = np.clip(at - left, 0, 1)[:, None]
+    expected = (1 - share) * image[:, left] + share * image[:, left + 1]
+    assert np.abs(found.reshape(expected.shape) - expected).max() < 2.5
+
+
+def test_too_little_memory_is_an_exception() -> None:
+    """The process aborted. Rays of a picture on its side need all their rows at once."""
+    turned = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    stack = replace(STACK, width_px=4000, height_px=3000)
+    pictures = [np.zeros((4000, 3000, 3), np.uint8)] * 2
+    plane = stack.panel(1).plane_from_raster() @ turned
+    left, right = (TargetView(picture, plane) for picture in pictures)
+    job = Job(Targets(stack, eyes(0.6), (left, right)))
+    child = os.fork()
+    if child == 0:
+        state = cpu.CpuState(stack, threads=1)
+        state.begin(job, job.targets.visible)
+        state.start()
+        used = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+        resource.setrlimit(resource.RLIMIT_AS, (used + 50_000_000, -1))
+        try:
+            state.step(Step(size=1.0))
+        except MemoryError:
+            os._exit(0)
+        os._exit(1)
+    assert os.waitpid(child, 0)[1] == 0
 
 
 def test_a_step_s_symbols_have_one_name_everywhere() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import threading
 from collections.abc import Iterator
 
@@ -47,6 +48,17 @@ def test_fresh_threads_have_the_niceness_of_their_caller() -> None:
     assert pool == [19, 19]
     fresh_threads()
     assert priorities() == [own] * 3
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_a_forked_process_starts_threads_of_its_own() -> None:
+    """It waited forever for those that only its parent has."""
+    assert parallel_map(abs, [-1, -2, -3]) == [1, 2, 3]
+    child = os.fork()
+    if child == 0:
+        signal.alarm(30)
+        os._exit(0 if parallel_map(abs, [-1, -2, -3]) == [1, 2, 3] else 1)
+    assert os.waitpid(child, 0)[1] == 0
 
 
 def test_the_presenter_comes_before_all_others_and_what_it_starts_does_not() -> None:
