@@ -90,8 +90,8 @@ class StackGeometry(Section):
         if depth_m > DEPTH_MOST * side_m:
             meant = ", ".join(f"{x_m / 100:g}" for x_m in self.x_m)  # as if given in centimetres
             raise ValueError(
-                f"x_m: the stack is {depth_m:g} m deep, but its panels are only {self.width_m:g} x {self.height_m:g} m; "
-                f"did you mean [{meant}]?"
+                f"x_m: the stack is {depth_m:g} m deep, but its panels are only {self.width_m:g} x "
+                f"{self.height_m:g} m; did you mean [{meant}]?"
             )
         return self
 

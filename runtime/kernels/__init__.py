@@ -165,7 +165,8 @@ def library() -> Any:
         if function is None:
             raise other
         function.argtypes, function.restype = arguments, None
-    for name in ("step", "close_middle", "warp", "squared_error"):
+    reporting = ("step", "close_middle", "warp", "squared_error") if hasattr(loops, "reports_status") else ()
+    for name in reporting:  # builds before the first that reported a status return nothing
         getattr(loops, name).restype, getattr(loops, name).errcheck = _int, _raise_failure
     short = ctypes.PyDLL(str(built))  # keeps the GIL, because the presenter could wait for it longer than it takes
     loops.frame_picture = short.frame_picture
