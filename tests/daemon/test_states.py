@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.frame.states import PARTS, Conditions, StateMachine, judge
+from runtime.clock import NS_PER_S
+from runtime.frame.states import PARTS, Conditions, Lateness, StateMachine, judge
 from runtime.records import State
 
 EYES = st.sampled_from(["exact", "interpolated", "predicted", "rested", "held", "none"])
@@ -78,3 +80,33 @@ def test_the_reason_is_never_empty_and_names_every_missing_part(conditions: Any)
     assert reason
     if state is State.DEGRADED:
         assert all(f"{part}: {why}" in reason for part, why in conditions.missing.items())
+
+
+def test_before_the_first_frame_the_state_names_what_it_waits_for() -> None:
+    waiting = well(presented=False, missing={"panel": "DUMMY1 is not connected"})
+    assert judge(waiting) == (State.STARTING, "waiting for panel: DUMMY1 is not connected")
+    assert judge(well(presented=False)) == (State.STARTING, "no frame has been presented yet")
+
+
+def shown(lateness: Lateness, *, of_60: int, from_s: int, to_s: int) -> list[str]:
+    """Messages at every refresh of a display of 60 Hz that shows only some of the refreshes of each second."""
+    told = []
+    for number in range(60 * from_s, 60 * to_s):
+        presented = number * of_60 // 60 != (number - 1) * of_60 // 60
+        told.append(lateness.update(presented=presented, now_ns=number * NS_PER_S // 60))
+    return told
+
+
+@pytest.mark.parametrize(("of_60", "late"), [(60, False), (55, False), (54, False), (51, True), (40, True)])
+def test_a_display_is_late_below_nine_tenths_of_its_rate(of_60: int, late: bool) -> None:
+    told = shown(Lateness(NS_PER_S // 60), of_60=of_60, from_s=0, to_s=5)
+    assert not any(told[: 2 * 60]), "a second to count, and a second of patience"
+    assert bool(told[-1]) == late
+    assert not late or told[-1] == f"late: {of_60} of 60 refreshes per second"
+
+
+@pytest.mark.parametrize(("of_60", "late"), [(54, True), (55, True), (58, False)])
+def test_a_late_display_is_on_time_again_only_well_above_that(of_60: int, late: bool) -> None:
+    lateness = Lateness(NS_PER_S // 60)
+    assert shown(lateness, of_60=40, from_s=0, to_s=5)[-1]
+    assert bool(shown(lateness, of_60=of_60, from_s=5, to_s=10)[-1]) == late

@@ -70,3 +70,37 @@ def test_a_few_bad_samples_are_counted_and_are_no_fault(reasons: tuple[str, ...]
     watch = p.RefusalWatch()
     assert not any([watch.update(reasons[k % len(reasons)]) for k in range(200)])
     assert watch.counts == {reasons[0]: 200 // len(reasons)} and watch.warning == ""
+
+
+@pytest.mark.parametrize("eye", [0, 1])
+@pytest.mark.parametrize(("x_m", "reason"), [(0.059, p.BEHIND), (0.06, p.BEHIND), (0.061, "")])
+def test_each_eye_must_be_in_front_of_the_front_panel(eye: int, x_m: float, reason: str) -> None:
+    eyes = np.array([[0.08, -0.031, 0.02], [0.08, 0.031, 0.02]])
+    eyes[eye, 0] = x_m
+    assert p.reason_against(eyes, in_front_m=0.06) == reason
+
+
+@pytest.mark.parametrize(("apart_mm", "reason"), [(49.9, p.TOO_CLOSE), (50.1, ""), (77.9, ""), (78.1, p.TOO_FAR_APART)])
+def test_peoples_eyes_are_between_50_and_78_millimetres_apart(apart_mm: float, reason: str) -> None:
+    assert p.reason_against(EYES * [1, apart_mm / 62, 1]) == reason
+
+
+@pytest.mark.parametrize(("distance_m", "reason"), [(19.9, ""), (20.1, p.TOO_DISTANT)])
+def test_no_viewer_is_farther_than_20_metres(distance_m: float, reason: str) -> None:
+    assert p.reason_against(EYES * [0, 1, 0] + [distance_m, 0, 0]) == reason
+
+
+def test_a_mistake_is_told_after_ten_samples_and_in_more_than_half() -> None:
+    told = [p.RefusalWatch() for _ in range(2)]
+    assert [bool(told[0].update(p.EXCHANGED)) for _ in range(10)] == [False] * 9 + [True]
+    half = [told[1].update(reason) for reason in ("", p.EXCHANGED) * 15]
+    assert not any(half)
+    assert told[1].update(p.EXCHANGED) != ""  # 16 of the last 30
+
+
+def test_a_warning_is_taken_back_below_a_quarter() -> None:
+    watch = p.RefusalWatch()
+    for _ in range(30):
+        watch.update(p.EXCHANGED)
+    told = [watch.update("") for _ in range(30)]
+    assert told.index("sensor: the eyes are plausible again") == 22  # 7 of the last 30 are left

@@ -124,7 +124,7 @@ def test_a_clock_that_was_set_back_begins_anew() -> None:
         (points([[0.6, np.inf, 0], [0.6, 0.03, 0]]), "not a number"),
         (points([[1e200, -0.031, 0.03], [1e200, 0.031, 0.03]]), "too far away for a viewer"),
         (points(STILL + np.array([0.2, 0, 0])), ELSEWHERE),
-        (points(confidence=0.1), UNCERTAIN),
+        (points(confidence=0.29), UNCERTAIN),
         (points(confidence=np.nan), UNCERTAIN),
     ],
 )
@@ -134,6 +134,11 @@ def test_a_single_bad_sample_changes_nothing_and_is_refused_with_its_reason(bad:
     assert tracker.update(bad, capture_ns=last + PERIOD) == why
     np.testing.assert_array_equal(tracker.at(last + 80 * MS).eyes_m, before.eyes_m)
     assert tracker.update(points(), capture_ns=last + PERIOD) == NOT_NEWER
+
+
+def test_a_sample_of_a_third_of_full_confidence_is_accepted() -> None:
+    tracker, last = fed()
+    assert tracker.update(points(confidence=0.31), capture_ns=last + PERIOD) == ""
 
 
 def test_a_hasty_head_is_followed_at_its_second_sample() -> None:

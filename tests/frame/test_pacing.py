@@ -213,3 +213,60 @@ def test_work_is_not_forgotten_while_pictures_are_left_out() -> None:
     for _ in range(60):
         _, now_ns = refresh(paced, display, now_ns, work_ns=4 * NS_PER_MS)
     assert paced.missed <= missed + 1
+
+
+@pytest.mark.parametrize(
+    ("work_ms", "held_ms", "lead_ms"),
+    [
+        ([3.0], None, 1.5),  # half of an increase is believed at once
+        ([160.0], None, 4.0),  # a stall of ten periods counts as half a period of work
+        ([160.0] * 60, None, 8.0),
+        ([160.0] * 60 + [0.0], None, 7.6),  # a twentieth of a decrease
+        ([160.0] * 60, 0.0, 14.4),  # nine tenths of a period if drawn frames wait until they are due
+        ([160.0] * 60 + [0.0], 0.0, 14.256),  # and a hundredth of a decrease
+        ([5.0], 2.0, 1.5),  # waiting is not work
+    ],
+)
+def test_work_times_are_learnt_within_limits(work_ms: list[float], held_ms: float | None, lead_ms: float) -> None:
+    paced = pacer()
+    held_ns = None if held_ms is None else round(held_ms * NS_PER_MS)
+    for spent_ms in work_ms:
+        timing = paced.predict(0)
+        paced.presented(timing, woke_ns=0, done_ns=round(spent_ms * NS_PER_MS), held_ns=held_ns)
+    assert lead(paced) == pytest.approx(lead_ms * NS_PER_MS, rel=1e-6)
+
+
+def test_each_missed_blank_widens_the_margin_up_to_half_a_period() -> None:
+    paced, leads = pacer(), []
+    for _ in range(10):
+        timing = paced.predict(0)
+        paced.presented(timing, woke_ns=0, done_ns=0, blank_ns=timing.present_ns + PERIOD_NS)
+        leads.append(lead(paced) / NS_PER_MS)
+    assert leads == pytest.approx([1.5, 2.25, 3.375, 5.0625, 7.59375, 8.0, 8.0, 8.0, 8.0, 8.0])
+    assert paced.missed >= 10
+    timing = paced.predict(0)
+    paced.presented(timing, woke_ns=0, done_ns=0, blank_ns=timing.present_ns)
+    assert lead(paced) == pytest.approx(0.9995 * 8.0 * NS_PER_MS)
+
+
+def test_a_tenth_of_a_blanks_error_moves_the_next_refresh() -> None:
+    paced = pacer()
+    timing = paced.predict(0)
+    paced.presented(timing, woke_ns=0, done_ns=0, blank_ns=timing.present_ns + 2 * NS_PER_MS)
+    assert paced.predict(0).present_ns == timing.present_ns + PERIOD_NS + NS_PER_MS // 5
+
+
+def test_a_held_frame_needs_no_margin_for_blanks_seen_before() -> None:
+    paced = pacer()
+    timing = paced.predict(0)
+    paced.presented(timing, woke_ns=0, done_ns=0, blank_ns=timing.present_ns)
+    assert lead(paced) == NS_PER_MS
+    timing = paced.predict(0)
+    paced.presented(timing, woke_ns=0, done_ns=0, held_ns=0)
+    assert lead(paced) == 0
+
+
+@pytest.mark.parametrize("period_ns", [0, -1])
+def test_a_period_that_is_not_positive_is_refused(period_ns: int) -> None:
+    with pytest.raises(ValueError, match="period_ns"):
+        pacer(period_ns=period_ns)

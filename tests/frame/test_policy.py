@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 from runtime.clock import NS_PER_MS
 from runtime.frame.policy import Decision, Flatness, FramePolicy, SolutionKey
 from runtime.plan.savings import Plan
-from runtime.records import SolveRequest
+from runtime.records import Effort, SolveRequest
 from tests.frame.fakes import EYES, aside
 
 STILL = Plan((True, True))
@@ -141,3 +142,24 @@ def test_it_never_leaves_its_range_nor_passes_where_it_goes(story: list[tuple[fl
         value = flatness.toward(target, now_ns=now_ns)
         assert 0.0 <= value <= 1.0
         assert abs(value - target) <= abs(before - target)
+
+
+@pytest.mark.parametrize(
+    ("done", "offered", "kind"),
+    [
+        (Effort(1, 4), Effort(1, 4), "nothing"),
+        (Effort(1, 4), Effort(1, 3), "nothing"),
+        (Effort(1, 4), Effort(1, 5), "refine"),
+        (Effort(1, 4), Effort(1, 5, continued_from=4), "refine"),
+        (Effort(2, 4), Effort(1, 0), "refine"),
+        (Effort(2, 4), Effort(3, 9), "nothing"),
+        (Effort(2, 4), Effort(1, 5, continued_from=4), "nothing"),  # was chosen for a solution on another raster
+        (Effort(1, 4), None, "nothing"),
+        (None, Effort(1, 4), "nothing"),
+    ],
+)
+def test_only_more_effort_refines_a_solution(done: Effort | None, offered: Effort | None, kind: str) -> None:
+    policy, key = FramePolicy(), SolutionKey(0, 0, EYES, done)
+    request = replace(wish(), eyes_label="rested", refined_to=offered)
+    flat = SolutionKey(0, 0, None)
+    assert policy.next_job(request, plan=STILL, state_version=0, revision=0, solved=key, flat=flat).kind == kind

@@ -116,3 +116,18 @@ def test_quantiles_cover_the_whole_run_and_remember_an_early_stall() -> None:
         assert figures.of("max")["max"] == max(number, 3000.0 if number >= 37 else 0.0)
     assert figures.of("p50")["p50"] == pytest.approx(5000, rel=0.02)
     assert figures.of("p99")["p99"] == pytest.approx(9900, rel=0.02)
+
+
+def test_missed_blanks_are_the_displays_total_and_skew_is_that_of_shown_refreshes() -> None:
+    stats = RunStats()
+    for number, missed in enumerate([0, 3, 5]):
+        stats.add(account(number, skew_ms=float(number), presented=number < 2), overhead_ms=0.1, missed_blanks=missed)
+    summary = stats.summary(stale_inputs=0)
+    assert summary["missed_blanks"] == 5
+    assert summary["skew_ms"] == {"p50": 0.5, "p99": 0.99, "max": 1.0}
+
+
+@pytest.mark.parametrize("rate_hz", [24, 60, 144, 480])
+def test_the_present_rate_is_right_for_slow_and_fast_displays(rate_hz: int) -> None:
+    stats = told([account(k, present_ns=round(k * NS_PER_S / rate_hz), inference="ran") for k in range(3 * rate_hz)])
+    assert stats.rates_now() == {"fps_now": rate_hz, "solutions_per_s_now": rate_hz}

@@ -15,7 +15,6 @@ from runtime.optics.alignment import (
     FARTHEST_M,
     MOST_SCALE,
     MOST_SHIFT,
-    NEAREST_M,
     Alignment,
     align,
     is_identity,
@@ -160,13 +159,13 @@ def test_eyes_that_are_nowhere_leave_the_layers_as_they_are(bad: float) -> None:
     assert all(is_identity(matrix) for matrix in behind.solved_from_shown) and behind.limited
 
 
-@pytest.mark.parametrize("x_m", [-1.0, 0.0, 0.06, 0.06 + 0.9 * NEAREST_M])
+@pytest.mark.parametrize("x_m", [-1.0, 0.0, 0.06, 0.069])
 def test_an_eye_at_the_front_panel_is_held_at_the_nearest_place(x_m: float) -> None:
     new = HEAD.copy()
     new[0, 0] = x_m
     aligned = align(STACK, solved_for_m=HEAD, eyes_m=new)
     assert "left eye" in aligned.limited and "front panel" in aligned.limited
-    share = (0.6 - 0.06 - NEAREST_M) / (0.6 - x_m)
+    share = (0.6 - 0.06 - 0.01) / (0.6 - x_m)  # a centimetre in front of the front panel
     nearest = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + share * (1 - 1e-12) * (new - HEAD))
     assert nearest.limited == ""
     assert same(aligned, nearest)

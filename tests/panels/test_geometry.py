@@ -66,3 +66,10 @@ def test_a_singular_homography_is_refused() -> None:
             screen_width_px=16, screen_height_px=16, layer_width_px=16, layer_height_px=16,
             rotation_deg=0, mirror="none", homography=((1, 0, 0), (2, 0, 0), (0, 0, 1)),
         )  # fmt: skip
+
+
+@pytest.mark.parametrize("place", [(2, 0), (2, 1)])
+def test_a_perspective_registration_is_no_permutation_however_weak(place: tuple[int, int]) -> None:
+    matrix = np.eye(3)
+    matrix[place] = 1e-12
+    assert not permutes_pixels(matrix)

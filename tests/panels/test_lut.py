@@ -42,6 +42,8 @@ def test_one_grey_column_serves_all_channels(tmp_path: Path) -> None:
         ("phase,grey\n0,0\n", "phase"),
         ("phase,grey\n0,0\n0,1\n", "phase"),
         ("phase,grey\n0,0\n1,1.5\n", "values"),
+        ("phase,grey\n-0.1,0\n1,1\n", "values"),
+        ("phase,grey\n0,-0.1\n1,1\n", "values"),
         ("phase,grey\n0,0\n1,nan\n", "values"),
         ("phase,grey\n0,0\n1,x\n", "rows"),
         ("phase,grey\n0,0\n1\n", "rows"),
