@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calib.robust import fit_robust
-from calib.solution import METHODS, Method, solve, solve_default
+from calib.solution import METHODS, Method, design_covariance, solve, solve_default
 from calib.viewpoints import grid, viewing_volume_m
 from tests.calib.camera import KNOWN_M, measured
 
@@ -106,3 +106,12 @@ def test_pairs_without_any_noise_leave_no_uncertainty() -> None:
     found = solve_default(corners, corners)
     assert found.noise_m == 0.0
     assert found.unit_covariance[6, 6] == 0.0
+
+
+@pytest.mark.parametrize("fixed_scale", [False, True])
+def test_a_design_that_leaves_a_rotation_open_has_no_finite_error(fixed_scale: bool) -> None:
+    line = np.outer(np.arange(5.0), [1.0, 2.0, 3.0])
+    _, covariance, condition = design_covariance(line, fixed_scale=fixed_scale)
+    assert np.isinf(condition) and np.isinf(covariance[:6, :6]).all()
+    _, covariance, condition = design_covariance(line + np.eye(5, 3), fixed_scale=fixed_scale)
+    assert np.isfinite(condition) and np.isfinite(covariance).all()

@@ -64,3 +64,15 @@ def test_points_that_determine_nothing_are_refused(points: NDArray[np.float64], 
         fit(points, points, rule="inverse")
     with pytest.raises(Degenerate, match=why):
         fit(points, cloud(0, len(points)), rule="inverse")
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_the_least_squares_scale_is_best_even_for_mirrored_points(mirrored: bool) -> None:
+    random = np.random.default_rng(3)
+    points = cloud(4)
+    sensor = points * [1, 1, -1 if mirrored else 1] + random.normal(scale=0.01, size=points.shape)
+    found = fit_batch(sensor[None], points[None], rule="least-squares")
+    centred, target = sensor - sensor.mean(0), points - points.mean(0)
+    turned = centred @ found.rotation[0].T
+    assert np.linalg.det(found.rotation[0]) == pytest.approx(1.0)
+    assert found.scale[0] == pytest.approx((turned * target).sum() / (centred**2).sum(), rel=1e-9)

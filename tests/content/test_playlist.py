@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from runtime.clock import NS_PER_S
-from runtime.content.base import ContentSource
+from runtime.config import ContentSettings
+from runtime.content.base import ContentInfo, ContentSource, View
+from runtime.content.playlist import PlaylistSource, read_playlist
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.support.artifacts import write_png
@@ -102,3 +104,66 @@ def test_a_list_that_is_wrong_is_one_line_that_names_its_entry(
         opened(path, context, stack)
     assert str(refused.value).startswith(f"{path}: {told}")
     assert "\n" not in str(refused.value)
+
+
+class Inner(ContentSource):
+    """Scene that keeps the times it was asked for."""
+
+    def __init__(self, stack: PanelStack, name: str) -> None:
+        self.info, self.closed = ContentInfo(name, moving=False, background=None), 0
+        self.picture = np.zeros((stack.height_px, stack.width_px, 4), np.uint8)
+        self.asked_ns: list[int] = []
+
+    def render(self, view: View, *, time_ns: int) -> np.ndarray:
+        self.asked_ns.append(time_ns)
+        return self.picture
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+@pytest.fixture
+def inner(folder: Path, stack: PanelStack) -> tuple[PlaylistSource, list[Inner]]:
+    scenes = [Inner(stack, name) for name in ("red", "green", "blue")]
+    playlist = read_playlist(written(folder, *THREE), ContentSettings())
+    return PlaylistSource(playlist, [lambda context, s=s: s for s in scenes], context=None), scenes
+
+
+def test_each_scene_has_a_time_that_begins_when_it_is_shown(
+    inner: tuple[PlaylistSource, list[Inner]], stack: PanelStack
+) -> None:
+    source, scenes = inner
+    for time_s in (100.0, 101.5, 102.0, 104.5, 106.0, 110.25):
+        source.render(panel_view(EYE, stack.panel(1)), time_ns=round(time_s * NS_PER_S))
+    shown_s = [[ns / NS_PER_S for ns in scene.asked_ns] for scene in scenes]
+    assert shown_s == [[0.0, 1.5, 0.0], [0.0, 2.5, 2.25], []]
+
+
+def test_closing_a_playlist_closes_every_scene(inner: tuple[PlaylistSource, list[Inner]]) -> None:
+    source, scenes = inner
+    source.close()
+    assert [scene.closed for scene in scenes] == [1, 1, 1]
+
+
+def test_no_revision_comes_back_when_a_later_round_is_skipped_through(
+    inner: tuple[PlaylistSource, list[Inner]],
+) -> None:
+    source, _ = inner
+    times_ns = [round(time_s * NS_PER_S) for time_s in (50.0, 52.5, 55.5, 56.5, 58.5)]
+    seen = [source.revision(time_ns=time_ns) for time_ns in times_ns]
+    for time_ns in (times_ns[-1], times_ns[-1] + NS_PER_S // 2, times_ns[-1] + NS_PER_S):
+        assert source.skip(time_ns=time_ns)
+        seen.append(source.revision(time_ns=time_ns))
+    assert seen == sorted(set(seen))
+
+
+def test_the_last_entry_without_repetition_has_no_end(folder: Path, context: Any, stack: PanelStack) -> None:
+    source = opened(written(folder, *THREE, head="repeat = false\n"), context, stack)
+    assert colour_at(source, stack, 10.0) == "red"
+    left_s = [source.describe(time_ns=round(time_s * NS_PER_S))["left_s"] for time_s in (11.5, 14.0, 15.5, 99.0)]
+    assert left_s == [0.5, 1.0, None, None]
+
+
+def test_files_of_an_entry_are_next_to_the_list(folder: Path) -> None:
+    playlist = read_playlist(written(folder, "scene = 'truck'\nfile = 'truck.ply'\nseconds = 2"), ContentSettings())
+    assert playlist.entries[0].file == str(folder / "truck.ply")

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from runtime.model.geometry import TargetView
+from runtime.model.job import Job, Targets
 from runtime.model.trim import (
     coarse_box,
     differing_box,
+    differing_window,
     parallax_margin_px,
     steepness,
     steepness_beside,
@@ -119,3 +124,45 @@ def test_before_white_a_window_is_smaller_than_before_grey() -> None:
     assert white.width_px < 0.7 * grey.width_px
     assert still_fits(grey, white) == (grey.width_px <= 1.3 * white.width_px)
     assert not still_fits(white, grey)
+
+
+def on_plane(picture: np.ndarray, stack: PanelStack) -> TargetView:
+    """A picture that covers the middle panel, whatever its number of pixels."""
+    height, width = picture.shape[:2]
+    raster = replace(stack, width_px=width, height_px=height).panel(1)
+    return TargetView(picture, raster.plane_from_raster())
+
+
+@pytest.mark.parametrize("aside_m", [-0.15, 0.0, 0.15])
+@pytest.mark.parametrize("times", [2, 3])
+def test_photographs_have_the_window_of_the_same_pictures_drawn(aside_m: float, times: int) -> None:
+    """Photographs have their own pixels, and are compared on a coarse raster over what the eyes see."""
+    eyes_m = EYES + np.array([0.0, aside_m, 0.0])
+    box = PixelRect(420, 240, 480, 300)
+    left = np.full((540, 960, 3), 100, np.uint8)
+    right = left.copy()
+    right[box.slices] = 200
+    drawn, taken = (
+        differing_window(Job(Targets(STACK, eyes_m, (on_plane(pair[0], STACK), on_plane(pair[1], STACK)))))
+        for pair in ((left, right), [np.repeat(np.repeat(p, times, axis=0), times, axis=1) for p in (left, right)])
+    )
+    assert drawn is not None and taken is not None
+    assert np.abs(np.array(drawn.box.corners) - taken.box.corners).max() <= 8
+    assert taken.box.u0 < box.u0 and taken.box.v0 < box.v0 and taken.box.u1 > box.u1 and taken.box.v1 > box.v1
+
+
+@pytest.mark.parametrize(("codes", "differs"), [(2, False), (3, True)])
+def test_differences_of_up_to_two_codes_are_ignored(codes: int, differs: bool) -> None:
+    left = np.full((100, 160, 3), 100, np.uint8)
+    right = left.copy()
+    right[40:50, 60:70] += np.uint8(codes)
+    assert bool(differing_box(left, right).width_px) == differs
+
+
+@pytest.mark.parametrize(("share", "whole"), [(0.45, False), (0.5, True)])  # with margins 0.57 and 0.61
+def test_a_window_of_over_six_tenths_of_the_panel_is_the_whole(share: float, whole: bool) -> None:
+    side = np.sqrt(share)
+    box = PixelRect(round(480 - 480 * side), round(270 - 270 * side), round(480 + 480 * side), round(270 + 270 * side))
+    far = np.array([[1e6, -0.03, 0.0], [1e6, 0.03, 0.0]])  # without parallax, the window is the box and its margin
+    found = window_around(box, far, replace(STACK, width_px=960), parallaxes=0.0)
+    assert (found is None) == whole
