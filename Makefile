@@ -6,12 +6,14 @@ DEMO_ARGS ?=
 PYTEST_ARGS ?=
 TEST_WORKERS ?= logical
 FUZZ_ARGS ?=
+ROOM ?= frame
+MUTATE_ARGS ?=
 GOLDEN_ARGS ?=
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
 NIGHTLY := out/nightly
 
-.PHONY: demo test test-slow golden lint types secrets coverage nightly package bench fuzz soak install uninstall system eye-models models gallery site hashes clean
+.PHONY: demo test test-slow golden lint types secrets coverage nightly package bench fuzz mutate soak install uninstall system eye-models models gallery site hashes clean
 
 demo: $(VENV)/.runtime
 	$(BIN)/phasestack demo $(DEMO_ARGS)
@@ -46,9 +48,11 @@ secrets: $(VENV)/.test
 coverage: $(VENV)/.test
 	$(BIN)/python -m pytest -m "not slow" -n $(TEST_WORKERS) --dist loadfile --cov --cov-report=term:skip-covered --cov-report=html:out/coverage
 
-# Checks that take too long for every change: the slow tests, coverage, every fuzzer, secrets in all files, and the frontier
-# against the night before (exit 1 if slower or worse beyond noise).
+# Checks that take too long for every change: the slow tests, coverage, every fuzzer, secrets in all files, other
+# mutations each night, and the frontier against the night before (exit 1 if slower or worse beyond noise).
 nightly: test-slow coverage fuzz secrets
+	for room in frame eyes optics model panels content calib kernels; do \
+	  $(BIN)/python -m tests.mutate $$room --count 20 --seed $$(date +%j) || exit 1; done
 	mkdir -p $(NIGHTLY)
 	$(BIN)/phasestack bench --out $(NIGHTLY)/bench-new.json
 	if [ -e $(NIGHTLY)/bench.json ]; then $(BIN)/phasestack bench compare $(NIGHTLY)/bench.json $(NIGHTLY)/bench-new.json; fi
@@ -64,6 +68,10 @@ bench: $(VENV)/.test
 # Every reader of untrusted bytes, some thousand bad files each; FUZZ_ARGS="-k gltf" for one of them.
 fuzz: $(VENV)/.test
 	FUZZ_EXAMPLES=$${FUZZ_EXAMPLES:-10000} $(BIN)/python -m pytest tests/fuzz -n $(TEST_WORKERS) --timeout 3600 $(FUZZ_ARGS)
+
+# Change one place of a room at a time, and count the changes that its tests notice; MUTATE_ARGS="--count 100 --seed 7".
+mutate: $(VENV)/.test
+	$(BIN)/python -m tests.mutate $(ROOM) $(MUTATE_ARGS)
 
 soak: $(VENV)/.test
 	$(BIN)/python -m tests.soak

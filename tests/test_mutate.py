@@ -1,0 +1,45 @@
+"""Tests the changes that `make mutate` makes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tests.mutate import files_of, mutations_of
+
+SOURCE = '''"""Ünïcode before the places that are changed."""
+LIMIT: int | 3 = 4
+
+def is_wide(é: int = 0) -> 2:
+    log.info("no change")
+    close(é)
+    return not é < LIMIT and True
+'''
+
+
+def test_each_change_is_one_place_that_still_compiles() -> None:
+    source = SOURCE.encode()
+    changed = {mutation.applied(source).decode() for mutation in mutations_of(Path("a.py"), source)}
+    places = (
+        ("= 4", "= (8)"),
+        ("= 0)", "= (1))"),
+        ("close(é)", "pass"),
+        ("é < LIMIT", "(é <= LIMIT)"),
+        ("not é < LIMIT", "(é < LIMIT)"),
+        ("not é < LIMIT and True", "(not é < LIMIT or True)"),
+        ("True", "(False)"),
+    )
+    assert changed == {SOURCE.replace(old, new) for old, new in places}
+    for text in changed:
+        compile(text, "a.py", "exec")
+
+
+def test_kernels_are_changed_by_their_operators_outside_comments() -> None:
+    source = b"if (a < b && c) d = e + f;  // g - h"
+    changed = [mutation.applied(source) for mutation in mutations_of(Path("a.cpp"), source)]
+    assert changed == [source.replace(b"<", b"<="), source.replace(b"&&", b"||"), source.replace(b"+", b"-", 1)]
+
+
+def test_a_room_is_a_package_a_part_is_a_file() -> None:
+    assert {path.name for path in files_of("kernels")} >= {"solver.cpp", "sampling.hpp"}
+    assert files_of("content/playlist") == [Path("runtime/content/playlist.py")]
+    assert Path("calib/similarity.py") in files_of("calib")
