@@ -24,7 +24,7 @@ from runtime.content.presets import preset_names
 from runtime.content.registry import open_content
 from runtime.errors import InputError
 from runtime.optics.malus import phase_from_intensity
-from runtime.optics.stack import PanelStack
+from runtime.optics.stack import PanelStack, between_pixel_centres
 from runtime.optics.views import image_from_raster, image_from_stack, stack_from_eye
 from runtime.records import F32, F64, U8
 from runtime.support.gl import offscreen_context
@@ -178,13 +178,11 @@ def _warped(picture: U8, picture_from_raster: F64, stack: PanelStack, border: in
 
     Args:
         picture: Picture (h, w, 3).
-        picture_from_raster: Homography from panel pixels to picture pixels, with pixel centres at half-integers. It is
-            converted for OpenCV, which puts pixel centres at integers.
+        picture_from_raster: Homography from panel pixels to picture pixels.
         stack: Panel geometry.
         border: OpenCV's border mode for pixels outside the picture.
     """
-    to_centres = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
-    matrix = np.linalg.inv(to_centres) @ picture_from_raster @ to_centres
+    matrix = between_pixel_centres(picture_from_raster)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     size = stack.width_px, stack.height_px
     return np.asarray(cv2.warpPerspective(picture, matrix, size, flags=flags, borderMode=border), np.uint8)

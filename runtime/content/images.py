@@ -7,13 +7,9 @@ import numpy as np
 
 from runtime.content.base import View
 from runtime.optics.rpu import panel_from_image
-from runtime.optics.stack import PlaneRaster
+from runtime.optics.stack import PlaneRaster, between_pixel_centres
 from runtime.optics.views import image_from_raster
 from runtime.records import F64, U8
-
-# Pixel centres have half-integer coordinates here, but integer coordinates in OpenCV.
-_HALF = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
-_MINUS_HALF = np.array([[1.0, 0.0, -0.5], [0.0, 1.0, -0.5], [0.0, 0.0, 1.0]])
 
 
 def rgba_from_rgb(rgb: U8) -> U8:
@@ -89,7 +85,7 @@ class WarpedPicture:
             out[:] = self._border
             return out
         picture, shrink = self._level(reduction(picture_from_view, view))
-        matrix = _MINUS_HALF @ np.diag([*shrink, 1.0]) @ picture_from_view @ _HALF
+        matrix = between_pixel_centres(np.diag([*shrink, 1.0]) @ picture_from_view)
         cv2.warpPerspective(
             picture,
             matrix,

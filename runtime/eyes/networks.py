@@ -15,6 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from runtime.optics.stack import between_pixel_centres
 from runtime.records import F32, F64, U8
 from runtime.support.onnx_runtime import onnxruntime
 
@@ -72,8 +73,8 @@ def resampled(picture: U8, size: tuple[int, int], crop_from_picture: F64) -> U8:
     part = picture[y0:y1, x0:x1]
     if ratio > 1.3:
         part = np.asarray(cv2.GaussianBlur(part, (0, 0), CROP_BLUR * np.sqrt(ratio * ratio - 1)), np.uint8)
-    warp = crop_from_picture.copy()
-    warp[:, 2] += warp[:, :2] @ [x0 + 0.5, y0 + 0.5] - 0.5  # continuous pixels to array indices
+    warp = crop_from_picture @ np.array([[1, 0, x0], [0, 1, y0], [0, 0, 1]])
+    warp = between_pixel_centres(np.vstack([warp, [0, 0, 1]]))[:2]
     return np.asarray(cv2.warpAffine(part, warp, size, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 

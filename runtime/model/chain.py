@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.optics.stack import PanelStack
+from runtime.optics.stack import PanelStack, Plane
 from runtime.records import F32, F64
 
 CELLS_STEP = 8  # chain lengths are rounded up to a multiple of this, so that a moving viewer causes few shapes
@@ -96,9 +96,7 @@ class ChainFrame:
 
     def plane_from_frame(self, eye_m: F64, *, x_m: float) -> F64:
         """Return the 3x3 map along a (3,) eye's rays from (t, v, 1) to (y, z, 1) on the plane at `x_m`."""
-        t = (x_m - self.x_m) / (eye_m[0] - self.x_m)
-        across = np.array([[1 - t, 0.0, eye_m[1] * t], [0.0, 1 - t, eye_m[2] * t], [0.0, 0.0, 1.0]])
-        return across @ self.plane_from_raster
+        return Plane(self.x_m).to(Plane(x_m), eye_m) @ self.plane_from_raster
 
     def frame_from_plane(self, *, x_m: float) -> F64:
         """Return the 3x3 map from (y, z, 1) on the plane at `x_m` to (t, v, 1), along rays from `middle_m`."""

@@ -15,9 +15,9 @@ import numpy as np
 
 from runtime.model.contract import Places
 from runtime.optics.rect import PixelRect
-from runtime.optics.stack import PanelStack, PlaneRaster
+from runtime.optics.stack import PanelStack, Plane, PlaneRaster
 from runtime.optics.tilt import coarse_layer_from_seen, layer_pixels_from_seen
-from runtime.optics.views import relative_scale_shift, stack_from_eye
+from runtime.optics.views import stack_from_eye
 from runtime.records import F32, F64, U8
 from runtime.support.gl import DrawnPicture
 
@@ -228,10 +228,8 @@ def panel_from_middle(stack: PanelStack, rasters: Sequence[PlaneRaster], eye_m: 
         rasters: Each panel's pixel grid, which may cover only a part of the panel.
         eye_m: (3,) eye in frame `stack`.
     """
-    source, target = rasters[stack.count // 2], rasters[n]
-    scale, shift_m = relative_scale_shift(eye_m, from_x_m=source.x_m, to_x_m=target.x_m)
-    across = np.array([[scale, 0.0, shift_m[0]], [0.0, scale, shift_m[1]], [0.0, 0.0, 1.0]])
-    matrix: F64 = target.raster_from_plane() @ across @ source.plane_from_raster()
+    target = rasters[n]
+    matrix = rasters[stack.count // 2].to(target, eye_m)
     if stack.tilt is not None:
         matrix = layer_pixels_from_seen(target, coarse_layer_from_seen(stack, n, eye_m)) @ matrix
     return np.asarray(matrix / matrix[2, 2], np.float64)
@@ -245,16 +243,17 @@ def visible_boxes(eyes_m: F64, stack: PanelStack) -> tuple[PixelRect, ...]:
     Args:
         eyes_m: (V, 3) eye positions in frame `stack`.
     """
-    middle_x_m, half = stack.x_m[stack.count // 2], np.array([stack.width_m, stack.height_m]) / 2
+    planes, half = [Plane(x_m) for x_m in stack.x_m], np.array([stack.width_m, stack.height_m]) / 2
+    middle = planes[stack.count // 2]
     lows, highs = [], []
     for eye_m in eyes_m:
-        seen = [relative_scale_shift(eye_m, from_x_m=x_m, to_x_m=middle_x_m) for x_m in stack.x_m]
+        seen = [plane.scale_shift_to(middle, eye_m) for plane in planes]
         lows.append(np.max([shift - half * scale for scale, shift in seen], axis=0))
         highs.append(np.min([shift + half * scale for scale, shift in seen], axis=0))
     low, high = np.min(lows, axis=0), np.max(highs, axis=0)
     boxes = []
-    for x_m in stack.x_m:
-        seen = [relative_scale_shift(eye_m, from_x_m=middle_x_m, to_x_m=x_m) for eye_m in eyes_m]
+    for plane in planes:
+        seen = [middle.scale_shift_to(plane, eye_m) for eye_m in eyes_m]
         corners = [corner * scale + shift for scale, shift in seen for corner in (low, high)]
         (left_m, bottom_m), (right_m, top_m) = np.min(corners, axis=0), np.max(corners, axis=0)
         u0, u1 = _span(left_m / stack.width_m + 0.5, right_m / stack.width_m + 0.5, stack.width_px)

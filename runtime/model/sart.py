@@ -23,7 +23,7 @@ from runtime.model.job import Job
 from runtime.model.targets import target_table
 from runtime.model.warp import picture_on
 from runtime.optics.malus import rest_value
-from runtime.optics.stack import PanelStack
+from runtime.optics.stack import PanelStack, between_pixel_centres
 from runtime.records import F32, F64
 
 ITERATIONS = 10
@@ -80,9 +80,7 @@ class SartPredictor(Predictor):
         Pixel centres are at integers, as in OpenCV.
         """
         rasters = [self.stack.panel(n) for n in range(self.stack.count)]
-        matrix = panel_from_middle(self.stack, rasters, eye_m, index)
-        to_corners = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
-        return np.asarray(np.linalg.inv(to_corners) @ matrix @ to_corners, np.float64)
+        return between_pixel_centres(panel_from_middle(self.stack, rasters, eye_m, index))
 
 
 def _warp(image: F32, matrix: Any) -> Any:

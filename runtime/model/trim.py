@@ -17,7 +17,7 @@ from runtime.model.job import NOWHERE, Job, SolveWindow
 from runtime.model.targets import is_grey
 from runtime.model.warp import picture_on
 from runtime.optics.rect import PixelRect, union
-from runtime.optics.stack import PanelStack
+from runtime.optics.stack import PanelStack, Plane
 from runtime.records import F64, U8
 from runtime.support.gl import DrawnPicture
 from runtime.support.threads import PIECE_ROWS, parallel_map
@@ -207,7 +207,7 @@ def parallax_margin_px(eyes_m: F64, stack: PanelStack) -> F64:
         (V, N, 2) shifts in pixels. The axes are the eye, the panel, and the direction (right, down). For rays through
         other points on the middle panel, the shifts are approximate.
     """
-    return np.asarray(_eyes_px(eyes_m, stack)[:, None] * _weights(eyes_m, stack)[..., None], np.float64)
+    return _scale_shift_px(eyes_m, stack)[1]
 
 
 def steepness(codes: U8) -> float:
@@ -248,19 +248,17 @@ def taper_px(eyes_m: F64, stack: PanelStack, *, parallaxes: float) -> tuple[floa
 def whole_rays(box: PixelRect, eyes_m: F64, stack: PanelStack) -> PixelRect:
     """Return the part of a window where rays stay inside the window on every panel.
 
-    Rays may leave the window at panel edges. The ray from an eye e through a point p on the centre panel meets a panel
-    of weight t (`_weights`) at p(1 - t) + e·t.
+    Rays may leave the window at panel edges.
 
     Args:
         box: Window in panel pixels.
         eyes_m: (V, 3) eye positions in frame `stack` (not relative to the window).
     """
-    weights = _weights(eyes_m, stack)
+    scale, shift_px = _scale_shift_px(eyes_m, stack)
     limits = []
     for axis, (start, end, whole) in enumerate(((box.u0, box.u1, stack.width_px), (box.v0, box.v1, stack.height_px))):
-        along = _eyes_px(eyes_m, stack)[:, axis, None] * weights
-        low = ((start - whole / 2 - along) / (1 - weights)).max() + whole / 2 + EDGE_PX
-        high = ((end - whole / 2 - along) / (1 - weights)).min() + whole / 2 - EDGE_PX
+        low = ((start - whole / 2 - shift_px[..., axis]) / scale).max() + whole / 2 + EDGE_PX
+        high = ((end - whole / 2 - shift_px[..., axis]) / scale).min() + whole / 2 - EDGE_PX
         first = max(int(np.ceil(low)), start) if start > 0 else 0
         last = min(int(np.floor(high)), end) if end < whole else whole
         limits.append((first, max(first, last)))
@@ -268,18 +266,18 @@ def whole_rays(box: PixelRect, eyes_m: F64, stack: PanelStack) -> PixelRect:
     return PixelRect(u0, v0, u1, v1)
 
 
-def _weights(eyes_m: F64, stack: PanelStack) -> F64:
-    """Return the (V, N) positions of the panels on a scale from the centre panel (0) to each eye (1)."""
-    middle_m = stack.x_m[stack.count // 2]
-    return np.asarray((np.array(stack.x_m) - middle_m) / (eyes_m[:, :1] - middle_m), np.float64)
+def _scale_shift_px(eyes_m: F64, stack: PanelStack) -> tuple[F64, F64]:
+    """Return the maps from the centre panel to each panel along each eye's rays.
 
+    Pixels are measured from the panels' centres, right and down.
 
-def _eyes_px(eyes_m: F64, stack: PanelStack) -> F64:
-    """Return the eyes' positions relative to the panels' centre, in pixels.
-
-    The result is a (V, 2) array of (right, down) rows.
+    Returns:
+        Scales (V, N) and shifts (V, N, 2) in pixels.
     """
-    return np.asarray(eyes_m[:, 1:] * (stack.width_px / stack.width_m, -stack.height_px / stack.height_m), np.float64)
+    centre = Plane(stack.x_m[stack.count // 2])
+    scales, shifts_m = zip(*(centre.scale_shift_to(Plane(x_m), eyes_m) for x_m in stack.x_m), strict=True)
+    px_per_m = stack.width_px / stack.width_m, -stack.height_px / stack.height_m
+    return np.stack(scales, axis=1), np.stack(shifts_m, axis=1) * px_per_m
 
 
 def window_around(box: PixelRect, eyes_m: F64, stack: PanelStack, *, parallaxes: float) -> PixelRect | None:
@@ -294,12 +292,12 @@ def window_around(box: PixelRect, eyes_m: F64, stack: PanelStack, *, parallaxes:
     Returns:
         The window, or None if it would cover most of the panel. Solving the whole panel is then as fast.
     """
-    parallax, weights, eyes_px = parallax_margin_px(eyes_m, stack), _weights(eyes_m, stack), _eyes_px(eyes_m, stack)
+    scale, shift_px = _scale_shift_px(eyes_m, stack)
     spans: list[tuple[int, int]] = []
     for axis, (start, end, whole) in enumerate(((box.u0, box.u1, stack.width_px), (box.v0, box.v1, stack.height_px))):
-        eyes = eyes_px[:, axis, None]  # relative to the panel's centre, as both ends of the box are below
-        before, after = (weights * (start - whole / 2 - eyes)).max(), (weights * (eyes - (end - whole / 2))).max()
-        room = parallaxes * float(np.ptp(parallax[..., axis], axis=0).max()) + MARGIN_PX
+        shift, ends = shift_px[..., axis], (start - whole / 2, end - whole / 2)  # relative to the panel's centre
+        before, after = (ends[0] - (ends[0] * scale + shift)).max(), (ends[1] * scale + shift - ends[1]).max()
+        room = parallaxes * float(np.ptp(shift, axis=0).max()) + MARGIN_PX
         low = max(start - (PANEL_CROSSINGS * max(float(before), 0.0) + room), 0.0)
         high = min(end + (PANEL_CROSSINGS * max(float(after), 0.0) + room), float(whole))
         step = whole / WINDOW_SHARES

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from runtime.kernels import EDGE_PX, KernelImage, Warp, library, with_margin
 from runtime.model.chain import EVEN_COLUMNS, ColumnLaw
 from runtime.model.geometry import SNAPPED, TargetView
-from runtime.optics.stack import PlaneRaster
+from runtime.optics.stack import PlaneRaster, between_pixel_centres
 from runtime.records import F64, I16, U8
 from runtime.support.threads import on_rows
 
@@ -93,8 +93,7 @@ def resample(
         size: Number of rows and columns in the new raster.
         edge: OpenCV's border mode.
     """
-    to_corners = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
-    at_centres = np.linalg.inv(to_corners) @ image_from_result @ to_corners
+    at_centres = between_pixel_centres(image_from_result)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return np.asarray(cv2.warpPerspective(image, at_centres, size[::-1], flags=flags, borderMode=edge))
 

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from runtime.optics.malus import rest_code
 from runtime.optics.relief import Displacement, displacement, parallax
-from runtime.optics.stack import PanelStack
+from runtime.optics.stack import PanelStack, Plane
 from runtime.records import F32, F64, U8, PanelFrame, Parallax
 
 FARTHEST_M = 1e6  # larger coordinates are treated as not finite
@@ -48,14 +48,13 @@ class Alignment:
     parallax: Parallax | None = None
 
 
-def reference_x_m(stack: PanelStack) -> float:
-    """Return the x coordinate of an alignment's reference plane.
+def reference_plane(stack: PanelStack) -> Plane:
+    """Return an alignment's reference plane.
 
-    The reference plane is the centre panel's plane or, if the number of panels is even, the plane halfway between the
-    two middle panels.
+    It is the centre panel's plane or, if the number of panels is even, the plane halfway between the two middle panels.
     """
     half = stack.count // 2
-    return stack.x_m[half] if stack.count % 2 else (stack.x_m[half - 1] + stack.x_m[half]) / 2
+    return Plane(stack.x_m[half] if stack.count % 2 else (stack.x_m[half - 1] + stack.x_m[half]) / 2)
 
 
 def align(stack: PanelStack, *, solved_for_m: F64, eyes_m: F64) -> Alignment:
@@ -87,7 +86,8 @@ def align(stack: PanelStack, *, solved_for_m: F64, eyes_m: F64) -> Alignment:
     if share == 0.0:
         return Alignment(_as_they_are(stack), limited)
     step_m = (new_m - old_m) * share
-    maps = tuple(_solved_from_shown(stack, n, old=old, step=step_m.tolist()) for n in range(stack.count))
+    reference, step = reference_plane(stack), step_m.tolist()
+    maps = tuple(stack.panel(n).to_and_back(reference, old_m=old, step_m=step) for n in range(stack.count))
     return Alignment(maps, limited, parallax(stack, old_m=old_m, new_m=old_m + step_m))
 
 
@@ -157,21 +157,6 @@ def _as_they_are(stack: PanelStack) -> tuple[F64, ...]:
     return tuple(np.eye(3) for _ in range(stack.count))
 
 
-def _solved_from_shown(stack: PanelStack, index: int, *, old: list[float], step: list[float]) -> F64:
-    """Return a panel's (3, 3) scale and shift for a midpoint that moves from `old` by `step`, in metres."""
-    raster, reference_m = stack.panel(index), reference_x_m(stack)
-    distance_m, height_m = old[0] - raster.x_m, old[0] - reference_m
-    now_m = distance_m + step[0]
-    magnified = step[0] * (reference_m - raster.x_m) / (now_m * height_m)
-    behind = (raster.x_m - reference_m) / height_m
-    right_m, up_m = (behind * (old[axis] * step[0] - step[axis] * distance_m) / now_m for axis in (1, 2))
-    # Pixel coordinates start at the panel's top left corner, not at its centre.
-    shift_u = (raster.left_m * magnified + right_m) / raster.pitch_u_m
-    shift_v = -(raster.top_m * magnified + up_m) / raster.pitch_v_m
-    scale = 1.0 + magnified
-    return np.array([[scale, 0.0, shift_u + 0.0], [0.0, scale, shift_v + 0.0], [0.0, 0.0, 1.0]])  # no negative zeros
-
-
 def _limits(
     stack: PanelStack, solved_x_m: list[float], eyes_x_m: list[float], *, old: list[float], step: list[float]
 ) -> Iterator[tuple[float, float, str]]:
@@ -192,7 +177,7 @@ def _limits(
         yield before_m - after_m, room_m, name
         if room_m < 0.0:
             return
-    reference_m = reference_x_m(stack)
+    reference_m = reference_plane(stack).x_m
     for n, x_m in enumerate(stack.x_m):
         if x_m == reference_m:
             continue

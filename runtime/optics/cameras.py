@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from runtime.optics.retina import Rays
-from runtime.optics.stack import PanelStack
+from runtime.optics.stack import PanelStack, between_pixel_centres
 from runtime.optics.views import stack_from_eye
 from runtime.records import F32, F64, U8
 
@@ -100,13 +100,12 @@ def looking_at_origin(
     focal_px = max(math.sqrt(abs(np.linalg.det(_slope(matrix)))) for matrix in pixels_from_gaze)
     size = [max(LEAST_PX, round(2 * focal_px * side)) for side in half]
     focal_px = size[0] / 2 / half[0]
-    direction = np.array([[1, 0, 0.5 - size[0] / 2], [0, 1, 0.5 - size[1] / 2], [0, 0, focal_px]]) / focal_px
-    centres = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])  # OpenCV's pixel centres are integers
+    direction = np.array([[1, 0, -size[0] / 2], [0, 1, -size[1] / 2], [0, 0, focal_px]]) / focal_px
     flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
     turned: list[Picture] = []
     for picture, matrix in zip(pictures, pixels_from_gaze, strict=True):
         warped: Any = cv2.warpPerspective(
-            picture, centres @ matrix @ direction, size, flags=flags, borderMode=cv2.BORDER_REPLICATE
+            picture, between_pixel_centres(matrix @ direction), size, flags=flags, borderMode=cv2.BORDER_REPLICATE
         )
         turned.append(warped if warped.dtype == np.uint8 else np.clip(warped, 0, 1))
     return turned, 2 * math.degrees(math.atan(half[0]))

@@ -173,15 +173,9 @@ def panels_from_centre(true_m: F64, stack: PanelStack) -> F64:
         (..., N, 3, 3) homographies along each eye's rays.
     """
     centre = stack.panel(stack.count // 2)
-    x, y, z = np.moveaxis(true_m[..., None], -2, 0)
-    share = (np.array(stack.x_m) - x) / (centre.x_m - x)
-    matrices = np.zeros((*share.shape, 3, 3))
-    matrices[..., 0, 0] = matrices[..., 1, 1] = share
-    matrices[..., 0, 2] = (y - centre.left_m) / centre.pitch_u_m * (1 - share)
-    matrices[..., 1, 2] = (centre.top_m - z) / centre.pitch_v_m * (1 - share)
-    matrices[..., 2, 2] = 1
+    matrices = np.stack([centre.to(stack.panel(n), true_m) for n in range(stack.count)], axis=-3)
     if stack.tilt is not None:
-        for place in np.ndindex(*share.shape):
+        for place in np.ndindex(*matrices.shape[:-2]):
             moved = layer_from_seen(stack, place[-1], true_m[place[:-1]])
             matrices[place] = layer_pixels_from_seen(stack.panel(place[-1]), moved) @ matrices[place]
     return matrices

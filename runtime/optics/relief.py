@@ -83,12 +83,7 @@ def parallax(stack: PanelStack, *, old_m: F64, new_m: F64) -> Parallax | None:
     places, weights = [], []
     for n in range(stack.count):
         raster = stack.panel(n)
-        # Project from this panel to the middle panel along rays from the new midpoint.
-        scale = new_x_m / (new[0] - raster.x_m)
-        y_m, z_m = new[1] + (raster.left_m - new[1]) * scale, new[2] + (raster.top_m - new[2]) * scale
-        u, v = (y_m - middle.left_m) / middle.pitch_u_m, (middle.top_m - z_m) / middle.pitch_v_m
-        across, down = scale * raster.pitch_u_m / middle.pitch_u_m, scale * raster.pitch_v_m / middle.pitch_v_m
-        places.append(np.array([[across, 0.0, u], [0.0, down, v], [0.0, 0.0, 1.0]]))
+        places.append(raster.to(middle, new_m))
         weights.append((old[0] - raster.x_m) / old_x_m * middle.pitch_u_m / raster.pitch_u_m)
     drift_px = (
         (k * new[1] - old[1] + growth * middle.left_m) / middle.pitch_u_m,

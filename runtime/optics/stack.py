@@ -1,22 +1,65 @@
-"""Geometry of the panel stack, and of pixel grids on planes parallel to the panels."""
+"""Geometry of the panel stack: planes parallel to the panels, pixel grids on them, and maps between these.
+
+Pixel positions (u, v) are continuous, with pixel centres at half-integers. OpenCV counts from the first pixel's centre;
+`between_pixel_centres` is the only place that converts between the two.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from runtime.records import F64
 
 UNEVEN_MOST = 0.15  # maximum (largest gap - smallest gap) / mean gap for the shipped networks (docs/models.md)
 
 
+_CORNER_FROM_CENTRE = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
+_CENTRE_FROM_CORNER = np.array([[1.0, 0.0, -0.5], [0.0, 1.0, -0.5], [0.0, 0.0, 1.0]])
+
+
+def between_pixel_centres(target_from_source: F64) -> F64:
+    """Convert a 3x3 homography between pixel grids for OpenCV, which has pixel centres at integers."""
+    return np.asarray(_CENTRE_FROM_CORNER @ target_from_source @ _CORNER_FROM_CENTRE, np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class Plane:
+    """The plane x = x_m in frame `stack`, with points (y, z) in metres."""
+
+    x_m: float
+
+    def scale_shift_to(self, other: Plane, eye_m: ArrayLike) -> tuple[F64, F64]:
+        """Return the scales (...), and the shifts (..., 2) in metres, that project this plane onto another.
+
+        The ray from the eye (..., 3) through the point p on this plane crosses the other plane at p·scale + shift.
+
+        Raises ValueError if an eye is in this plane.
+        """
+        eye = np.asarray(eye_m, np.float64)
+        distance_m = eye[..., 0] - self.x_m
+        if not np.all(distance_m):
+            raise ValueError("an eye in a panel's plane cannot see through the panel")
+        shift_m = eye[..., 1:] * ((other.x_m - self.x_m) / distance_m)[..., None]
+        return np.asarray((eye[..., 0] - other.x_m) / distance_m), shift_m
+
+    def to(self, other: Plane, eye_m: ArrayLike) -> F64:
+        """Return the projection of `scale_shift_to` as (..., 3, 3) matrices for points (y, z, 1)."""
+        scale, shift_m = self.scale_shift_to(other, eye_m)
+        matrix = np.zeros((*scale.shape, 3, 3))
+        matrix[..., 0, 0] = matrix[..., 1, 1] = scale
+        matrix[..., :2, 2], matrix[..., 2, 2] = shift_m, 1.0
+        return matrix
+
+
 @dataclass(frozen=True, slots=True)
 class PlaneRaster:
     """Pixel grid on the plane x = x_m in frame `stack`. u points along +y (right) and v along -z (down).
 
-    Pixel coordinates are continuous, with pixel centres at half-integers. The pixel position (u, v) lies at y = left_m
-    + u·pitch_u_m and z = top_m - v·pitch_v_m.
+    The pixel position (u, v) lies at y = left_m + u·pitch_u_m and z = top_m - v·pitch_v_m.
     """
 
     x_m: float
@@ -26,6 +69,37 @@ class PlaneRaster:
     pitch_v_m: float
     width_px: int
     height_px: int
+
+    @property
+    def plane(self) -> Plane:
+        return Plane(self.x_m)
+
+    def to(self, other: PlaneRaster, eye_m: ArrayLike) -> F64:
+        """Return the (..., 3, 3) maps to another raster's pixels along the rays of eyes (..., 3).
+
+        Raises ValueError if an eye is in this raster's plane.
+        """
+        return np.asarray(other.raster_from_plane() @ self.plane.to(other.plane, eye_m) @ self.plane_from_raster())
+
+    def to_and_back(self, via: Plane, *, old_m: Sequence[float], step_m: Sequence[float]) -> F64:
+        """Return the 3x3 scale and shift that project pixels onto a plane from one eye, and back from another.
+
+        The first eye is at old_m + step_m, the second at old_m. The result is exactly the identity if the step is zero
+        or the plane is the raster's. `optics.alignment` derives the equation. Plain floats are several times as fast
+        here as small arrays.
+        """
+        distance_m, height_m = old_m[0] - self.x_m, old_m[0] - via.x_m
+        now_m = distance_m + step_m[0]
+        magnified = step_m[0] * (via.x_m - self.x_m) / (now_m * height_m)
+        behind = (self.x_m - via.x_m) / height_m
+        right_m, up_m = (behind * (old_m[k] * step_m[0] - step_m[k] * distance_m) / now_m for k in (1, 2))
+        # Pixel coordinates start at the raster's top left corner, not at the plane's origin.
+        shift_u = (self.left_m * magnified + right_m) / self.pitch_u_m
+        shift_v = -(self.top_m * magnified + up_m) / self.pitch_v_m
+        scale = 1.0 + magnified
+        return np.array(
+            [[scale, 0.0, shift_u + 0.0], [0.0, scale, shift_v + 0.0], [0.0, 0.0, 1.0]]
+        )  # no negative zeros
 
     def stack_from_raster(self) -> F64:
         """Return the 3x3 matrix from pixels (u, v, 1) to coordinates (x, y, z) in frame `stack`."""

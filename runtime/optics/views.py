@@ -82,19 +82,3 @@ def raster_from_stack(eye_m: ArrayLike, raster: PlaneRaster) -> F64:
 def image_from_raster(image_from_stack: F64, raster: PlaneRaster) -> F64:
     """Return the 3x3 homography from raster pixels to pixels in an eye's image (H in (40)-(42))."""
     return image_from_stack[:, :3] @ raster.stack_from_raster() + np.outer(image_from_stack[:, 3], [0.0, 0.0, 1.0])
-
-
-def relative_scale_shift(eye_m: ArrayLike, *, from_x_m: float, to_x_m: float) -> tuple[float, F64]:
-    """Return the scale, and the (2,) shift in metres, that project a plane onto a parallel plane.
-
-    The ray from the eye through the point p = (y, z) on the plane x = from_x_m crosses the plane x = to_x_m at p·scale
-    + shift.
-
-    Raises ValueError if the eye is in the plane x = from_x_m.
-    """
-    eye = np.asarray(eye_m, dtype=np.float64)
-    distance_m = eye[0] - from_x_m
-    if distance_m == 0.0:
-        raise ValueError("an eye in a panel's plane cannot see through the panel")
-    scale = (eye[0] - to_x_m) / distance_m
-    return float(scale), eye[1:] * ((to_x_m - from_x_m) / distance_m)

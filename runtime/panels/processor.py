@@ -27,6 +27,7 @@ from runtime.optics.alignment import is_identity, scale_and_shift
 from runtime.optics.malus import rest_code
 from runtime.optics.rect import PixelRect, union
 from runtime.optics.relief import displacement
+from runtime.optics.stack import between_pixel_centres
 from runtime.panels import lut
 from runtime.panels.geometry import layer_from_screen, panel_from_screen
 from runtime.panels.presentation import shows_flat, shows_solved
@@ -373,8 +374,7 @@ def _registered(picture: Array, mounting: Mounting, *, screen_px: tuple[int, int
         reduced_from_turned = np.diag(np.array([width / mounting.turned_px[0], height / mounting.turned_px[1], 1.0]))
         screen_from_reduced = np.diag(np.array([screen_px[0] / width, screen_px[1] / height, 1.0]))
         matrix = reduced_from_turned @ matrix @ screen_from_reduced
-    middle = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])  # OpenCV counts from pixel centres
-    matrix, picture = np.linalg.inv(middle) @ matrix @ middle, np.ascontiguousarray(picture)
+    matrix, picture = between_pixel_centres(matrix), np.ascontiguousarray(picture)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     warped = cv2.warpPerspective(picture, matrix, (width, height), flags=flags, borderMode=border)
     return np.asarray(warped, picture.dtype)

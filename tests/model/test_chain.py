@@ -19,8 +19,7 @@ from runtime.model.chain import (
     chain_frame,
     chain_modes,
 )
-from runtime.optics.stack import PanelStack
-from runtime.optics.views import relative_scale_shift
+from runtime.optics.stack import PanelStack, Plane
 from runtime.report.pairs import eyes_at
 from tests.model.scenes import STACK, eyes
 
@@ -48,8 +47,8 @@ def test_sigma_moves_the_outer_panels_as_a_displaced_eye_does() -> None:
 
     def on(eye: np.ndarray, x_m: float) -> np.ndarray:
         """Raster position of the point where the eye's ray through `at` meets a panel, seen from between the eyes."""
-        here, shift = relative_scale_shift(eye, from_x_m=frame.x_m, to_x_m=x_m)
-        there, back = relative_scale_shift(frame.middle_m, from_x_m=x_m, to_x_m=frame.x_m)
+        here, shift = Plane(frame.x_m).scale_shift_to(Plane(x_m), eye)
+        there, back = Plane(x_m).scale_shift_to(Plane(frame.x_m), frame.middle_m)
         return raster_from_plane @ np.append((at[:2] * here + shift) * there + back, 1.0)
 
     columns, rows, own = frame.eye_sigma_px(STACK, eye_sigma_m=2e-3, cell_px=4)
@@ -97,9 +96,9 @@ def test_both_outer_panels_are_seen_one_cell_beside_the_middle_view(
     for x_m, sign in ((STACK.x_m[0], 1), (STACK.x_m[2], -1)):
         on_panel = {}
         for name, eye in (("left", pair[0]), ("right", pair[1]), ("middle", frame.middle_m)):
-            scale, shift = relative_scale_shift(eye, from_x_m=frame.x_m, to_x_m=x_m)
+            scale, shift = Plane(frame.x_m).scale_shift_to(Plane(x_m), eye)
             on_panel[name] = somewhere[:2] * scale + shift
-        scale, shift = relative_scale_shift(frame.middle_m, from_x_m=frame.x_m, to_x_m=x_m)
+        scale, shift = Plane(frame.x_m).scale_shift_to(Plane(x_m), frame.middle_m)
         for name, direction in (("left", -1), ("right", 1)):
             aligned = (on_panel[name] - shift) / scale
             moved = raster_from_plane @ np.append(aligned, 1.0) - raster_from_plane @ somewhere
@@ -149,7 +148,7 @@ def test_a_column_law_inverts_and_without_bend_is_even() -> None:
 def test_the_raster_covers_all_panels_from_the_side_too() -> None:
     for angle_deg in (-50, -20, 20, 50):
         frame = chain_frame(eyes_at(distance_m=0.7, angle_deg=angle_deg), STACK, most_cell_px=4, reduction=2)
-        scale, shift = relative_scale_shift(frame.middle_m, from_x_m=STACK.x_m[1], to_x_m=frame.x_m)
+        scale, shift = Plane(STACK.x_m[1]).scale_shift_to(Plane(frame.x_m), frame.middle_m)
         raster_from_plane = np.linalg.inv(frame.plane_from_raster)
         for y in (-0.5, 0.5):
             for z in (-0.5, 0.5):
@@ -165,7 +164,7 @@ def test_the_raster_covers_what_is_seen_of_all_panels() -> None:
     frame = chain_frame(eyes(0.6), STACK, most_cell_px=4, reduction=2)
     corners = frame.plane_from_raster @ np.array([[0, frame.width_px], [0, frame.rows], [1, 1]])
     # The rear panel is the smallest as seen on the plane between.
-    scale, _ = relative_scale_shift(frame.middle_m, from_x_m=STACK.x_m[0], to_x_m=frame.x_m)
+    scale, _ = Plane(STACK.x_m[0]).scale_shift_to(Plane(frame.x_m), frame.middle_m)
     assert corners[0].min() <= -STACK.width_m / 2 * scale
     assert corners[0].max() >= STACK.width_m / 2 * scale
     assert corners[1].max() >= STACK.height_m / 2 * scale

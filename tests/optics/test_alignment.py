@@ -18,7 +18,7 @@ from runtime.optics.alignment import (
     Alignment,
     align,
     is_identity,
-    reference_x_m,
+    reference_plane,
     shown_layers,
 )
 from runtime.optics.malus import intensity_from_phase
@@ -61,7 +61,7 @@ def test_the_ray_from_the_new_midpoint_meets_what_the_old_one_met(
 ) -> None:
     aligned = align(stack, solved_for_m=old, eyes_m=new)
     assume(not aligned.limited)
-    point = (reference_x_m(stack), y * stack.width_m, z * stack.height_m)
+    point = (reference_plane(stack).x_m, y * stack.width_m, z * stack.height_m)
     for panel, matrix in enumerate(aligned.solved_from_shown):
         shown = hit_px(stack, new.mean(axis=0), point, panel=panel)
         met = hit_px(stack, old.mean(axis=0), point, panel=panel)
@@ -80,7 +80,7 @@ def test_a_head_moving_parallel_to_the_panels_is_aligned_exactly(
     assume(not aligned.limited)
     for panel, matrix in enumerate(aligned.solved_from_shown):
         for before, after in zip(old, new, strict=True):
-            point = (reference_x_m(stack), 0.1 * stack.width_m, -0.2 * stack.height_m)
+            point = (reference_plane(stack).x_m, 0.1 * stack.width_m, -0.2 * stack.height_m)
             shown, met = (hit_px(stack, eye, point, panel=panel) for eye in (after, before))
             assert moved_px(matrix, shown) == pytest.approx(met, rel=1e-9, abs=1e-6)
 
@@ -104,8 +104,8 @@ def test_a_panel_in_the_reference_plane_never_moves(
 
 
 def test_an_even_number_of_panels_meets_between_the_middle_two() -> None:
-    assert reference_x_m(PanelStack(0.5, 0.3, (0.01, 0.02, 0.04, 0.09), 64, 36)) == pytest.approx(0.03)
-    assert reference_x_m(PanelStack(0.5, 0.3, (0.01, 0.02, 0.09), 64, 36)) == 0.02
+    assert reference_plane(PanelStack(0.5, 0.3, (0.01, 0.02, 0.04, 0.09), 64, 36)).x_m == pytest.approx(0.03)
+    assert reference_plane(PanelStack(0.5, 0.3, (0.01, 0.02, 0.09), 64, 36)).x_m == 0.02
 
 
 @given(

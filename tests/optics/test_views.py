@@ -10,13 +10,12 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from runtime.optics.stack import PanelStack
+from runtime.optics.stack import PanelStack, Plane
 from runtime.optics.views import (
     image_from_camera,
     image_from_raster,
     image_from_stack,
     raster_from_stack,
-    relative_scale_shift,
     stack_from_eye,
 )
 from tests.optics import reference
@@ -137,34 +136,11 @@ def test_the_plane_induced_homography_is_the_projection_of_the_pixels_place(
     np.testing.assert_allclose(raster.raster_from_plane() @ raster.plane_from_raster(), np.eye(3), atol=1e-12)
 
 
-@given(eyes(), floats(-0.1, 0.02), floats(-0.1, 0.02), floats(-0.3, 0.3), floats(-0.3, 0.3))
-def test_between_panels_there_is_only_a_scale_and_a_shift(
-    eye: np.ndarray, from_x: float, to_x: float, y: float, z: float
-) -> None:
-    direction = reference.subtract((from_x, y, z), tuple(eye))
-    assume(direction[0] != 0.0)
-    hit = reference.hit_plane(tuple(eye), direction, to_x)
-    scale, shift = relative_scale_shift(eye, from_x_m=from_x, to_x_m=to_x)
-    np.testing.assert_allclose(np.array([y, z]) * scale + shift, hit[1:], atol=1e-12)
-    back, back_shift = relative_scale_shift(eye, from_x_m=to_x, to_x_m=from_x)
-    assert scale * back == pytest.approx(1.0, abs=1e-12)
-    np.testing.assert_allclose(shift * back + back_shift, 0, atol=1e-12)
-
-
-def test_an_eye_in_a_panels_plane_has_no_way_through_it() -> None:
-    with pytest.raises(ValueError, match="cannot see through"):
-        relative_scale_shift([0.03, 0.0, 0.0], from_x_m=0.03, to_x_m=0.0)
-
-
 def test_eyes_in_single_precision_or_whole_metres_are_taken_as_doubles() -> None:
     raster = PanelStack(0.5, 0.3, (-0.06, 0.0, 0.06), 64, 36).panel(0)
     for eye in (np.array([0.61, 0.13, -0.07], np.float32), np.array([2, 1, 0])):
         double = eye.astype(np.float64)
         assert np.array_equal(stack_from_eye(eye), stack_from_eye(double))
         assert np.array_equal(raster_from_stack(eye, raster), raster_from_stack(double, raster))
-        for one, other in zip(
-            relative_scale_shift(eye, from_x_m=0.01, to_x_m=-0.06),
-            relative_scale_shift(double, from_x_m=0.01, to_x_m=-0.06),
-            strict=True,
-        ):
-            assert np.array_equal(one, other) and np.asarray(one).dtype == np.float64
+        for one, other in zip(*(Plane(0.01).scale_shift_to(Plane(-0.06), at) for at in (eye, double)), strict=True):
+            assert np.array_equal(one, other) and one.dtype == np.float64

@@ -15,8 +15,8 @@ import numpy as np
 
 from runtime.optics.malus import intensity_from_phase, phase_from_intensity
 from runtime.optics.rpu import panel_from_image
-from runtime.optics.stack import PanelStack
-from runtime.optics.views import image_from_stack, relative_scale_shift, stack_from_eye
+from runtime.optics.stack import PanelStack, Plane
+from runtime.optics.views import image_from_stack, stack_from_eye
 from runtime.report.stability.trial import EPS64, Answer, Trial
 
 POSE, RPU, PHASE, JONES = "eye pose", "RPU", "phase", "Jones optics"
@@ -99,7 +99,7 @@ def gaze(eye: Sequence[float]) -> Answer:
 
 def scale_shift(eye: Sequence[float], to_x_m: float) -> Answer:
     """Compare the mapping along rays from the centre panel to a parallel plane with the reference."""
-    scale, shift = relative_scale_shift(eye, from_x_m=0.0, to_x_m=to_x_m)
+    scale, shift = Plane(0.0).scale_shift_to(Plane(to_x_m), eye)
     e, point = extended(eye), extended([0, 0.125, -0.0625])
     truth = (point + to_x_m / e[0] * (e - point))[1:]
     size = float(max(*np.abs(truth), abs(e[1] * to_x_m / e[0])))
