@@ -17,8 +17,8 @@ Random = np.random.Generator
 
 
 @dataclass(frozen=True, slots=True)
-class Plane:
-    """A textured parallelogram.
+class Parallelogram:
+    """Textured parallelogram of a scene.
 
     The texture's point (u, v) is at corner + u·across + v·down for 0 <= u, v <= 1.
     """
@@ -29,7 +29,7 @@ class Plane:
     down_m: F64  # (3,) vector along the left edge
 
 
-Scene = tuple[Plane, ...]
+Scene = tuple[Parallelogram, ...]
 
 
 def draw(scene: Scene, projection: F64, *, width_px: int, height_px: int) -> U8:
@@ -123,7 +123,7 @@ def random_scene(random: Random, stack: PanelStack, middle_m: F64) -> Scene:
     contrast, level = (1.0, 0.0) if random.random() < 0.4 else (random.uniform(0.15, 0.8), random.uniform(-0.25, 0.25))
     tones = np.clip(np.rint((np.arange(256) - 127.5) * contrast + 127.5 + 255 * level), 0, 255).astype(np.uint8)
 
-    def card(x_m: float, size_m: F64, aside: F64, *, slant: float, see_through: bool) -> Plane:
+    def card(x_m: float, size_m: F64, aside: F64, *, slant: float, see_through: bool) -> Parallelogram:
         """Return a card with a random texture.
 
         Args:
@@ -141,7 +141,7 @@ def random_scene(random: Random, stack: PanelStack, middle_m: F64) -> Scene:
         corner = np.array([x_m, *middle]) - across / 2 - down / 2
         corner[0] -= max(0.0, corner[0] + max(across[0], 0) + max(down[0], 0) - max(front_m, x_m))
         width, height = np.clip(size_m / pixel_m * random.uniform(0.3, 1.0), *TEXELS).astype(int).tolist()
-        return Plane(_texture(random, width, height, tones, see_through=see_through), corner, across, down)
+        return Parallelogram(_texture(random, width, height, tones, see_through=see_through), corner, across, down)
 
     backdrop_m = rear_m * random.uniform(1.0, 1.3)
     size_m = 1.5 * (1 - (backdrop_m - centre_m) / distance_m) * panel_m

@@ -26,7 +26,7 @@ from model_export.export import export_model, picture_file  # noqa: E402
 from model_export.light import Views, improved, light_db  # noqa: E402
 from model_export.modules import Form, make_network  # noqa: E402
 from model_export.pairs import TrainingPairs, network_input  # noqa: E402
-from model_export.scene import Plane, Scene, draw  # noqa: E402
+from model_export.scene import Parallelogram, Scene, draw  # noqa: E402
 from model_export.train import Training, _held_out_db, displayed, run_training  # noqa: E402
 from model_export.validate import validate_file  # noqa: E402
 from runtime.commands.app import app  # noqa: E402
@@ -58,7 +58,7 @@ def drawn(scene: Scene, eye: np.ndarray) -> np.ndarray:
 def test_a_plane_is_drawn_where_the_projection_puts_it() -> None:
     white = np.full((40, 40, 4), 255, np.uint8)
     centre = np.array([-0.1, 0.05, -0.03])
-    plane = Plane(white, centre - [0, 0.01, -0.01], np.array([0, 0.02, 0.0]), np.array([0, 0, -0.02]))
+    plane = Parallelogram(white, centre - [0, 0.01, -0.01], np.array([0, 0.02, 0.0]), np.array([0, 0, -0.02]))
     for eye in EYES:
         picture = drawn((plane,), eye).mean(axis=2)
         v_px, u_px = np.mgrid[0:270, 0:480] + 0.5
