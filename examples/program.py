@@ -41,7 +41,7 @@ def main() -> None:
     target = context.simple_framebuffer((16, 16))
     context.enable(moderngl.DEPTH_TEST)
     with connect(sys.argv[1], max_size=None, compression=None) as socket:
-        socket.send(json.dumps({"name": "a cube", "rows": "bottom-up"}))
+        socket.send(json.dumps({"name": "a cube", "rows": "bottom-up", "depth": "float32"}))
         for message in socket:
             asked = json.loads(message)
             if target.size != (asked["width"], asked["height"]):
@@ -54,7 +54,9 @@ def main() -> None:
                 target.clear(0.9, 0.95, 1.0, 1.0)
                 array.render()
                 side = 0 if eye["eye"] == "left" else 1
-                socket.send(struct.pack("<II", asked["frame"], side) + target.read(components=4))
+                # With the depth, the cube also follows the eyes between two pictures.
+                depth = target.read(components=1, attachment=-1, dtype="f4")
+                socket.send(struct.pack("<II", asked["frame"], side) + target.read(components=4) + depth)
 
 
 if __name__ == "__main__":

@@ -9,15 +9,17 @@ import weakref
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from runtime.config import Section, validated
 from runtime.content.base import ContentInfo, ContentSource, View
 from runtime.content.camera import clip_from_stack
 from runtime.content.placing import SceneFile
-from runtime.content.program_server import SIDES, AskedViews, ProgramServer, acquire, release
-from runtime.records import U8
+from runtime.content.program_server import SIDES, AskedViews, ProgramPicture, ProgramServer, acquire, release
+from runtime.records import F32, U8
 
 NEAR_M, FAR_M = 0.05, 100.0
 
@@ -34,7 +36,8 @@ def prepare(file: SceneFile) -> Callable[[Any], ContentSource]:
     Raises InputError if the options are invalid or the port cannot be opened.
     """
     options = validated(ProgramOptions, file.settings.options, source="content.options")
-    source = ProgramSource(acquire(options.port), background=file.background)
+    display_m = file.stack.width_m, file.stack.height_m
+    source = ProgramSource(acquire(options.port), display_m=display_m, background=file.background)
     return lambda context: source
 
 
@@ -61,9 +64,10 @@ def camera_of(view: View) -> dict[str, Any]:
 class ProgramSource(ContentSource):
     """Source that shows pictures drawn by a connected program for the requested eye positions."""
 
-    def __init__(self, server: ProgramServer, *, background: Any) -> None:
+    def __init__(self, server: ProgramServer, *, display_m: tuple[float, float], background: Any) -> None:
         """Create a source that gives the server back when it is closed."""
-        self._server = server
+        self._server, self._display_m = server, display_m
+        self._shown: dict[int, ProgramPicture] = {}  # latest pictures, keyed by side
         self.info = ContentInfo("program", moving=True, background=background)
         self._expected: tuple[int, list[View]] | None = None  # number and views of the requested frame
         self._released = weakref.finalize(self, release, server)
@@ -79,18 +83,49 @@ class ProgramSource(ContentSource):
     def expect(self, views: Sequence[View], *, time_ns: int) -> None:
         self._expected = None
         width_px, height_px = views[0].width_px, views[0].height_px
-        asked = AskedViews(time_ns, width_px, height_px, tuple(camera_of(view) for view in views))
+        asked = AskedViews(time_ns, width_px, height_px, tuple(map(camera_of, views)), self._display_m)
         self._expected = self._server.ask(asked), list(views)
 
     def render(self, view: View, *, time_ns: int) -> U8:
         if self._expected is None or not any(_same(view, one) for one in self._expected[1]):
             self.expect([view], time_ns=time_ns)
         assert self._expected is not None
-        drawn = self._server.drawn(self._expected[0])
-        return np.ascontiguousarray(drawn.pictures[view.side])
+        picture = self._shown[view.side] = self._server.drawn(self._expected[0]).pictures[view.side]
+        if picture.pixels.shape[:2] == (view.height_px, view.width_px):
+            return np.ascontiguousarray(picture.pixels)
+        return np.asarray(cv2.resize(picture.pixels, (view.width_px, view.height_px)), np.uint8)
+
+    def nearness(self, view: View, *, every: int, first: tuple[int, int]) -> F32 | None:
+        picture = self._shown.get(view.side)
+        if picture is None or picture.depth is None:
+            return None
+        depth: NDArray[Any] = picture.depth
+        if depth.shape != (view.height_px, view.width_px):
+            depth = np.asarray(cv2.resize(depth, (view.width_px, view.height_px), interpolation=cv2.INTER_NEAREST))
+        return nearness_of(depth, every=every, first=first)
 
     def close(self) -> None:
+        self._shown.clear()
         self._released()
+
+
+def nearness_of(depth: NDArray[Any], *, every: int, first: tuple[int, int]) -> F32:
+    """Return the inverse distance to the nearest point in each block of a depth picture, in 1/m.
+
+    Args:
+        depth: (h, w) values of the depth buffer, drawn with a projection from `camera_of`: 0-1, or 0-65535.
+        every: Side length of the square blocks, in pixels.
+        first: Numbers of columns and rows that are missing from the first block at its left and top.
+    """
+    farthest = 65535 if depth.dtype == np.uint16 else 1
+    rows, columns = (-(-(size + start) // every) for size, start in zip(depth.shape, first[::-1]))
+    padded = np.full((rows * every, columns * every), farthest, depth.dtype)
+    padded[first[1] : first[1] + depth.shape[0], first[0] : first[0] + depth.shape[1]] = depth
+    lines = padded.reshape(rows, every, columns * every).min(1)
+    nearest = lines.reshape(rows, columns, every).min(2).astype(np.float32) / np.float32(farthest)
+    # Between the near and far planes, depth is linear in the inverse distance.
+    inverse = np.float32(1 / NEAR_M) - nearest * np.float32(1 / NEAR_M - 1 / FAR_M)
+    return np.where((nearest >= 0) & (nearest < 1), inverse, np.float32(0))
 
 
 def _same(view: View, other: View) -> bool:

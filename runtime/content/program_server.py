@@ -7,16 +7,19 @@ program that reads slowly loses only its own messages. docs/programs.md describe
 from __future__ import annotations
 
 import asyncio
+import fcntl
 import hmac
 import json
 import logging
+import mmap
+import os
 import secrets
 import socket as sockets
 import struct
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -29,7 +32,7 @@ from websockets.exceptions import ConnectionClosed
 
 from runtime.clock import NS_PER_S
 from runtime.errors import ContentFailure, InputError, one_line
-from runtime.records import U8
+from runtime.records import F32, U8, U16
 from runtime.support.background import begin
 
 log = logging.getLogger("phasestack.content")
@@ -47,6 +50,12 @@ CONNECTIONS_MAX = 32  # largest number of connected programs
 QUEUED_MAX = 4  # largest number of messages that the library holds for each connection
 HEAD = struct.Struct("<II")  # an answer's header: frame number and side (0 left, 1 right)
 SIDES = ("left", "right")
+SCALE_MIN = 0.1  # smallest pictures that a program can ask to draw, as a fraction of the display's width and height
+DEPTHS: dict[str, np.dtype[Any]] = {
+    "uint16": np.dtype("<u2"),
+    "float32": np.dtype("<f4"),
+}  # pixel types of depth pictures
+SLOTS = 4  # frames in shared memory: two in flight, the newest, and the one that the solver still reads
 MESSAGE_MAX_BYTES = 8 * 7680 * 4320 + HEAD.size
 WRONG_DATA, LEAVING, TOO_BIG = 1007, 1001, 1009  # close codes of RFC 6455
 
@@ -59,6 +68,7 @@ class AskedViews:
     width_px: int
     height_px: int
     eyes: tuple[dict[str, Any], ...]  # see `program.camera_of`; `eye` is left or right
+    display_m: tuple[float, float]  # width and height of the panels
 
     @property
     def sides(self) -> tuple[int, ...]:
@@ -66,11 +76,77 @@ class AskedViews:
 
 
 @dataclass(frozen=True, slots=True)
+class ProgramPicture:
+    """An eye's picture, with the top row first. It may be smaller than requested."""
+
+    pixels: U8  # RGBA (h, w, 4)
+    depth: F32 | U16 | None  # (h, w) values of the depth buffer, or None if the program does not send it
+
+
+@dataclass(frozen=True, slots=True)
 class DrawnPictures:
     """A frame's complete set of pictures."""
 
     number: int  # of the frame, as returned by `ask`
-    pictures: Mapping[int, U8]  # RGBA (h, w, 4) with the top row first, keyed by side
+    pictures: Mapping[int, ProgramPicture]  # keyed by side
+
+
+@dataclass(frozen=True, slots=True)
+class _Form:
+    """Size and parts of a program's pictures."""
+
+    width_px: int
+    height_px: int
+    depth: np.dtype[Any] | None
+    bottom_up: bool
+
+    @property
+    def pixels_bytes(self) -> int:
+        return 4 * self.width_px * self.height_px
+
+    @property
+    def bytes(self) -> int:
+        depth_bytes = 0 if self.depth is None else self.depth.itemsize
+        return (4 + depth_bytes) * self.width_px * self.height_px
+
+    def picture(self, data: memoryview) -> ProgramPicture:
+        """Return the picture in a message or in shared memory, without copying it.
+
+        Raises ValueError if the data has the wrong size.
+        """
+        if len(data) != self.bytes:
+            parts = "RGBA pixels" if self.depth is None else f"RGBA pixels and {self.depth.name} depths"
+            raise ValueError(f"the answer has {len(data)} bytes, which is not {self.width_px}x{self.height_px} {parts}")
+        order = -1 if self.bottom_up else 1
+        rows, columns = self.height_px, self.width_px
+        pixels = np.frombuffer(data[: self.pixels_bytes], np.uint8).reshape(rows, columns, 4)[::order]
+        if self.depth is None:
+            return ProgramPicture(pixels, None)
+        return ProgramPicture(
+            pixels, np.frombuffer(data[self.pixels_bytes :], self.depth).reshape(rows, columns)[::order]
+        )
+
+
+class _Memory:
+    """Memory that a program on the same machine can write its pictures to.
+
+    A file in memory has no name, so it ends with the last process that uses it. The program opens it through this
+    process's entry in /proc, which only the same user can do. It cannot be made smaller, because reading beyond its end
+    would end the process.
+    """
+
+    def __init__(self, size_bytes: int) -> None:
+        """Allocate the memory. Raises OSError if that is not possible."""
+        self._file = os.memfd_create("phasestack-program", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+        os.ftruncate(self._file, size_bytes)
+        fcntl.fcntl(self._file, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL)
+        self.path = f"/proc/{os.getpid()}/fd/{self._file}"
+        self.bytes = size_bytes
+        self.data = memoryview(mmap.mmap(self._file, size_bytes))  # unmapped once no picture refers to it
+
+    def close(self) -> None:
+        """Close the file. Pictures in the memory remain valid."""
+        os.close(self._file)
 
 
 @dataclass(slots=True)
@@ -79,7 +155,9 @@ class _Frame:
 
     asked: AskedViews
     asked_s: float  # request time on the monotonic clock
-    pictures: dict[int, U8] = field(default_factory=dict)  # keyed by side
+    form: _Form
+    pictures: dict[int, ProgramPicture] = field(default_factory=dict)  # keyed by side
+    places: dict[int, memoryview] = field(default_factory=dict)  # the pictures' places in shared memory, keyed by side
 
 
 class _Connection(ServerConnection):
@@ -110,12 +188,59 @@ class _Client:
     """A connected program, with the messages that it has not yet taken."""
 
     def __init__(self, connection: ServerConnection, hello: dict[str, Any]) -> None:
+        """Read a program's first message. Raises ValueError if one of its fields is invalid."""
         self.connection = connection
         self.listens = bool(hello.get("listens"))
         self.bottom_up = hello.get("rows") == "bottom-up"
         self.name = one_line(str(hello.get("name", "unnamed")), most=80)
-        self._messages: deque[str] = deque(maxlen=1 if self.listens else IN_FLIGHT_MAX)
+        scale, depth = hello.get("scale", 1), hello.get("depth")
+        if not isinstance(scale, int | float) or not SCALE_MIN <= scale <= 1:
+            raise ValueError(f"scale must be a number from {SCALE_MIN} to 1")
+        if depth is not None and depth not in tuple(DEPTHS):
+            raise ValueError(f"depth must be {' or '.join(DEPTHS)}")
+        self._scale = scale
+        self._depth: np.dtype[Any] | None = None if depth is None else DEPTHS[depth]
+        self._shares_memory, self._frames_shared = bool(hello.get("memory")), 0
+        self._memory: _Memory | None = None
+        self._messages: deque[str] = deque(maxlen=1 if self.listens else 2 * IN_FLIGHT_MAX)
         self._has_messages = asyncio.Event()
+
+    def form(self, asked: AskedViews) -> _Form:
+        """Return the size and parts of the pictures for a request."""
+        width_px, height_px = (max(1, round(size * self._scale)) for size in (asked.width_px, asked.height_px))
+        return _Form(width_px, height_px, self._depth, self.bottom_up)
+
+    def request(self, number: int, frame: _Frame) -> None:
+        """Leave a request for the program and, if it uses shared memory, choose the places of the pictures."""
+        asked, size_bytes = frame.asked, frame.form.bytes
+        eyes = list(asked.eyes)
+        if self._shares_memory and self._has_memory(2 * SLOTS * size_bytes):
+            assert self._memory is not None
+            self._frames_shared += 1
+            for n, (side, eye) in enumerate(zip(asked.sides, asked.eyes)):
+                at = (2 * (self._frames_shared % SLOTS) + side) * size_bytes
+                frame.places[side] = self._memory.data[at : at + size_bytes]
+                eyes[n] = eye | {"at": at}
+        self.post(_message(number, asked, frame.form.width_px, frame.form.height_px, eyes))
+
+    def _has_memory(self, size_bytes: int) -> bool:
+        """Ensure that there is enough shared memory, and tell the program if it is new."""
+        if self._memory is None or self._memory.bytes < size_bytes:
+            self.close()
+            try:
+                self._memory = _Memory(size_bytes)
+            except OSError as error:
+                log.warning("no memory can be shared with the program: %s", error.strerror)
+                self._shares_memory = False
+                return False
+            self.post(json.dumps({"memory": {"path": self._memory.path, "bytes": size_bytes}}))
+        return True
+
+    def close(self) -> None:
+        """Release the shared memory."""
+        if self._memory is not None:
+            self._memory.close()
+            self._memory = None
 
     def post(self, message: str) -> None:
         """Leave a message for the program. A message that is not taken in time is replaced by later ones."""
@@ -179,10 +304,9 @@ class ProgramServer:
             self._frames = {n: frame for n, frame in self._frames.items() if now_s - frame.asked_s < GIVEN_UP_S}
             is_asked = program is not None and len(self._frames) < IN_FLIGHT_MAX
             if is_asked:
-                self._frames[number] = _Frame(asked, now_s)
-        message: dict[str, Any] = {"frame": number, "time_s": asked.time_ns / NS_PER_S, "width": asked.width_px}
-        message |= {"height": asked.height_px, "eyes": asked.eyes}
-        self._call(self._post, json.dumps(message), program if is_asked else None)
+                assert program is not None
+                self._frames[number] = _Frame(asked, now_s, program.form(asked))
+        self._call(self._post, number, asked, program if is_asked else None)
         if program is None:
             why = f" ({self.problem})" if self.problem else ""
             raise ContentFailure(
@@ -251,10 +375,16 @@ class ProgramServer:
         connection.shaken()
         return None
 
-    def _post(self, message: str, program: _Client | None) -> None:
-        for client in self._clients:
-            if client.listens or client is program:
+    def _post(self, number: int, asked: AskedViews, program: _Client | None) -> None:
+        listeners = [client for client in self._clients if client.listens]
+        if listeners:
+            message = _message(number, asked, asked.width_px, asked.height_px, asked.eyes)
+            for client in listeners:
                 client.post(message)
+        frame = self._frames.get(number)
+        if program in self._clients and frame is not None:
+            assert program is not None
+            program.request(number, frame)
 
     async def _connected(self, connection: ServerConnection) -> None:
         """Serve a connection. A program's first message states whether it draws or only listens."""
@@ -306,10 +436,12 @@ class ProgramServer:
         """Forget a client. Has no effect if it was forgotten before."""
         if client is not None:
             self._clients.discard(client)
+            client.close()
         with self._changed:
             if client is None or self._drawing is not client:
                 return
             self._drawing, self.problem = None, why
+            self.newest = None  # so that shared memory is released
             self._frames.clear()
             self._changed.notify_all()
         log.warning("lost the drawing program: %s", why)
@@ -327,12 +459,8 @@ class ProgramServer:
             frame = self._frames.get(number)
             if client is not self._drawing or frame is None or side not in frame.asked.sides:
                 return  # the frame was abandoned
-        width, height = frame.asked.width_px, frame.asked.height_px
-        size = len(message) - HEAD.size
-        if size != 4 * width * height:
-            raise ValueError(f"the answer has {size} bytes, which is not {width}x{height} RGBA pixels")
-        picture = np.frombuffer(message, np.uint8, offset=HEAD.size).reshape(height, width, 4)
-        frame.pictures[side] = picture[::-1] if client.bottom_up else picture
+        data = memoryview(message)[HEAD.size :]
+        frame.pictures[side] = frame.form.picture(frame.places[side] if not data and side in frame.places else data)
         if len(frame.pictures) == len(frame.asked.eyes):
             self._complete(number, frame)
 
@@ -344,6 +472,12 @@ class ProgramServer:
             if self.newest is None or number > self.newest.number:
                 self.newest = DrawnPictures(number, frame.pictures)
             self._changed.notify_all()
+
+
+def _message(number: int, asked: AskedViews, width_px: int, height_px: int, eyes: Sequence[dict[str, Any]]) -> str:
+    """Return the request for a frame, as sent to a program."""
+    size = {"width": width_px, "height": height_px, "display_m": asked.display_m}
+    return json.dumps({"frame": number, "time_s": asked.time_ns / NS_PER_S, **size, "eyes": eyes})
 
 
 def _shortened(why: str) -> str:

@@ -78,6 +78,8 @@ class Program:
             self._begun.set()
             try:
                 for message in self.socket:
+                    if "memory" in json.loads(message):
+                        continue
                     self.asked.append(json.loads(message))
                     for side, eye in enumerate(self.asked[-1]["eyes"]):
                         answer = self._answer(self.asked[-1], eye)
@@ -323,6 +325,124 @@ def test_who_listens_is_told_of_the_eyes_and_asked_for_nothing(source: Any) -> N
     assert [eye["eye_m"] for eye in listener.asked[0]["eyes"]] == EYES.tolist()
     program.end()
     listener.end()
+
+
+def test_a_program_may_draw_smaller_pictures(source: Any) -> None:
+    program = Program(source, scale=0.5)
+    left, right = drawn(source)
+    assert (program.asked[0]["width"], program.asked[0]["height"]) == (32, 18)
+    assert left.shape == right.shape == (36, 64, 3) and (left[..., 0] == 200).all() and (right[..., 0] == 100).all()
+    program.end()
+
+
+def plane_and_background(asked: dict, eye: dict, dtype: str) -> bytes:
+    """The panels' plane x = 0 in front of the background, at the left; rows at the top are nearer by 0.2 m."""
+    width, height = asked["width"], asked["height"]
+    look, projection = (np.reshape(eye[name], (4, 4)).T for name in ("view", "projection"))
+    depth = np.ones((height, width))
+    for row in range(height):
+        clip = projection @ look @ [0.2 if row < height // 2 else 0.0, 0.0, 0.0, 1.0]
+        depth[row, : width // 2] = (clip[2] / clip[3] + 1) / 2
+    farthest = 65535 if dtype == "uint16" else 1
+    return picture_of(asked, eye) + (depth * farthest).astype(dtype).tobytes()
+
+
+@pytest.mark.parametrize("dtype", ["uint16", "float32"])
+@pytest.mark.parametrize("scale", [1, 0.5])
+@pytest.mark.parametrize("first", [(0, 0), (1, 2)])
+def test_a_program_may_send_depth(source: Any, dtype: str, scale: float, first: tuple[int, int]) -> None:
+    program = Program(source, partial(plane_and_background, dtype=dtype), depth=dtype, scale=scale)
+    views = raster_views(EYES, STACK.panel(0))
+    source.expect(views, time_ns=0)
+    for view in views:
+        source.render(view, time_ns=0)
+        nearness = source.nearness(view, every=4, first=first)
+        assert nearness.shape == (-(-(36 + first[1]) // 4), -(-(64 + first[0]) // 4))
+        np.testing.assert_allclose(nearness[:4, :7], 1 / 0.4, rtol=1e-3)
+        np.testing.assert_allclose(nearness[6:9, :7], 1 / 0.6, rtol=1e-3)
+        assert (nearness[:, 9:] == 0).all()
+    program.end()
+
+
+def test_without_depth_the_distances_are_unknown(source: Any) -> None:
+    program = Program(source)
+    drawn(source)
+    assert source.nearness(raster_views(EYES, STACK.panel(0))[0], every=4, first=(0, 0)) is None
+    program.end()
+
+
+class Sharing(Program):
+    """Writes its pictures to shared memory, and sends only their heads."""
+
+    def __init__(self, source: Any, **hello: Any) -> None:
+        self.paths: list[str] = []
+        super().__init__(source, memory=True, **hello)
+
+    def _run(self) -> None:
+        with connect(self._address, max_size=None, compression=None) as self.socket:
+            self.socket.send(json.dumps({"name": "test"} | self._hello))
+            time.sleep(0.1)
+            self._begun.set()
+            for message in self.socket:
+                asked = json.loads(message)
+                if "memory" in asked:
+                    self.paths.append(asked["memory"]["path"])
+                    self.memory = np.memmap(self.paths[-1], np.uint8, "r+")
+                    continue
+                self.asked.append(asked)
+                for side, eye in enumerate(asked["eyes"]):
+                    picture = picture_of(asked, eye)
+                    self.memory[eye["at"] : eye["at"] + len(picture)] = np.frombuffer(picture, np.uint8)
+                    self.socket.send(struct.pack("<II", asked["frame"], side))
+
+
+def test_a_program_on_the_same_machine_may_share_memory(source: Any) -> None:
+    program = Sharing(source)
+    for _ in range(10):
+        left, right = drawn(source)
+        assert (left[..., 0] == 200).all() and (right[..., 0] == 100).all()
+    assert len({eye["at"] for asked in program.asked for eye in asked["eyes"]}) == 8  # four frames of two pictures
+    larger = raster_views(EYES, replace(STACK, width_px=128, height_px=72).panel(0))
+    source.expect(larger, time_ns=0)
+    assert (source.render(larger[1], time_ns=0)[..., 0] == 100).all()
+    assert len(program.paths) == 2
+    program.end()
+    source.close()
+    del program.memory  # the client's own mapping
+    assert eventually(lambda: open_memories() == 0)
+
+
+def open_memories() -> int:
+    number = 0
+    for one in Path("/proc/self/fd").iterdir():
+        with suppress(FileNotFoundError):
+            number += str(one.readlink()).startswith("/memfd:phasestack-program")
+    return number
+
+
+def test_shared_memory_cannot_be_cut_off(source: Any) -> None:
+    program = Sharing(source)
+    drawn(source)
+    with Path(program.paths[0]).open("r+b") as memory, pytest.raises(PermissionError):
+        os.ftruncate(memory.fileno(), 0)
+    program.end()
+
+
+def test_a_program_that_cannot_open_the_memory_sends_its_pictures(source: Any) -> None:
+    program = Program(source, memory=True)
+    assert (drawn(source)[1][..., 0] == 100).all()
+    program.end()
+
+
+@pytest.mark.parametrize(
+    ("hello", "why"),
+    [({"scale": 0}, "scale must be a number from 0.1 to 1"), ({"depth": "int8"}, "depth must be uint16 or float32")],
+)
+def test_a_wrong_greeting_is_answered_with_the_reason(source: Any, hello: dict, why: str) -> None:
+    with connect(source.program["address"]) as socket:
+        socket.send(json.dumps(hello))
+        with pytest.raises(ConnectionClosed, match=why):
+            socket.recv(10)
 
 
 @pytest.mark.parametrize("hello", ["{", "[]", b"\x00"])
