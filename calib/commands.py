@@ -74,6 +74,8 @@ def grey(
     show: Annotated[
         bool, typer.Option("--show", help="show the chart on the panel until Enter or q is pressed")
     ] = False,
+    white_deg: Annotated[float, number(30.0, 90.0, help="angle by which full white turns the polarization")] = 90.0,
+    black_deg: Annotated[float, number(0.0, 29.0, help="angle by which black turns the polarization")] = 0.0,
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -81,7 +83,8 @@ def grey(
 
     First show the chart with --show. In a dark room, photograph it with any camera from two or three positions. Lock
     the exposure, keep the whole chart in the picture and avoid overexposure. Then pass the folder with the photographs
-    as --photos.
+    as --photos. Photographs cannot show a panel's angles: find them with an analyser, and pass --white-deg and
+    --black-deg.
 
     Example: phasestack calibrate grey --panel 2 --photos photos --out panel-2.csv
     """
@@ -92,10 +95,12 @@ def grey(
     if panel >= stack.count:
         raise InputError("calibrate grey", "--panel", f"must be from 0 to {stack.count - 1}")
     if photos is not None and out is not None:
-        from calib.grey_chart import lut_from_photographs
+        from calib.grey_chart import AngleRange, lut_from_photographs
         from calib.photographs import photographs
 
-        _report(lut_from_photographs(out, photographs(photos), stack, panel=panel, source=str(photos)), as_json)
+        turns = AngleRange(black_deg, white_deg)
+        pictures = photographs(photos)
+        _report(lut_from_photographs(out, pictures, stack, panel=panel, source=str(photos), turns=turns), as_json)
         return
     from calib.display import grey_layers, open_display, show_until_key
     from calib.grey_chart import grey_charts

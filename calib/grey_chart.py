@@ -6,8 +6,8 @@ they are used to calibrate the camera. Marks from the calibration board, placed 
 the patches in a photograph.
 
 If the other panels are at zero, a panel with phase p between crossed polarizers shows dark + range·sin²(pi/2·p)
-(EyeReal, (4)). Full white is assumed to be phase 1. Photographs cannot show whether a panel actually reaches this
-phase.
+(EyeReal, (4)). Photographs cannot show by how much black and full white turn the polarization. Unless these angles are
+given (`AngleRange`), black is taken for phase 0 and full white for phase 1.
 """
 
 from __future__ import annotations
@@ -42,6 +42,14 @@ FALLS = 0.01  # maximum decrease in intensity from a grey to the next brighter o
 CLIPPED = 0.02  # share of clipped pixels in white patches above which a photograph is overexposed
 LUT_ROWS = 256  # one row for each 8-bit phase
 BAYER = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]])
+
+
+@dataclass(frozen=True, slots=True)
+class AngleRange:
+    """Angles by which a panel turns the polarization. They are found by turning an analyser to the darkest position."""
+
+    black_deg: float = 0.0
+    white_deg: float = 90.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +121,13 @@ def grey_charts(stack: PanelStack, panel: int) -> U8:
 
 
 def lut_from_photographs(
-    out: Path, pictures: Iterable[tuple[str, U8]], stack: PanelStack, *, panel: int, source: str
+    out: Path,
+    pictures: Iterable[tuple[str, U8]],
+    stack: PanelStack,
+    *,
+    panel: int,
+    source: str,
+    turns: AngleRange | None = None,
 ) -> dict[str, Any]:
     """Measure a panel's grey curve from photographs of its chart, and write the LUT.
 
@@ -123,6 +137,7 @@ def lut_from_photographs(
         stack: Panel geometry.
         panel: Panel index.
         source: Origin of the photographs, used in error messages.
+        turns: The panel's angles at black and full white, 0 and 90 degrees by default.
 
     Returns:
         A summary of the run, for the command to report.
@@ -132,16 +147,21 @@ def lut_from_photographs(
     """
     measured = [histograms(picture, stack, panel, source=f"{source}, {name}") for name, picture in pictures]
     intensity, residual = measure(measured, stack, panel, source=source)
-    write_lut(out, intensity)
+    write_lut(out, intensity, turns or AngleRange())
     return {"file": str(out), "grey": GREYS, "intensity": intensity, "residual": residual}
 
 
-def write_lut(out: Path, intensity: F64) -> None:
-    """Write a LUT with 256 rows of phase and grey (0 to 1), given the intensities (13,) of `GREYS`."""
+def write_lut(out: Path, intensity: F64, turns: AngleRange) -> None:
+    """Write a LUT with 256 rows of phase and grey (0 to 1), given the intensities (13,) of `GREYS`.
+
+    The intensities are relative: 0 at black and 1 at full white. Phases out of the panel's range get its nearest grey.
+    """
     # The square root of the intensity is smooth at both ends, for bare panels and for monitors with a tone curve.
     root = PchipInterpolator(np.array(GREYS) / 255, np.sqrt(np.maximum.accumulate(intensity)))
     fine, rows = np.linspace(0.0, 1.0, 4097), np.linspace(0.0, 1.0, LUT_ROWS)
-    greys = np.interp(rows, phase_from_intensity(np.clip(root(fine), 0.0, 1.0) ** 2, branch=1), fine)
+    black, white = (float(np.sin(np.radians(angle)) ** 2) for angle in (turns.black_deg, turns.white_deg))
+    transmitted = black + (white - black) * np.clip(root(fine), 0.0, 1.0) ** 2
+    greys = np.interp(rows, phase_from_intensity(transmitted, branch=1), fine)
     text = "".join(f"{phase:.6f},{grey:.6f}\n" for phase, grey in zip(rows, greys, strict=True))
     write_text(out, "phase,grey\n" + text)
 

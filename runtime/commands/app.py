@@ -25,6 +25,7 @@ from runtime.commands.run import run
 from runtime.commands.setup import setup
 from runtime.commands.solve import solve
 from runtime.commands.stability import stability
+from runtime.commands.tolerance import tolerance
 from runtime.commands.try_ import try_
 
 app = typer.Typer(
@@ -50,6 +51,7 @@ COMMANDS: tuple[Callable[..., None] | tuple[str, typer.Typer | Callable[..., Non
     validate,
     report,
     stability,
+    tolerance,
     ("bench", bench_app),
     doctor,
     status,

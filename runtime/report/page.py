@@ -79,20 +79,21 @@ class Page:
         """Return all figures on the page, in order of appearance."""
         return [figure for section in self.sections for figure in section.figures]
 
-    def write(self, out: Path, *, data: Any) -> None:
-        """Write index.html, the pictures and report.json, which stores the data, to a folder.
+    def write(self, out: Path, *, data: Any, data_name: str = "report.json") -> None:
+        """Write index.html, the pictures and a JSON file, which stores the data, to a folder.
 
         Either all files appear in the folder or none does.
 
         Args:
             out: Folder to write to; created if necessary.
-            data: Contents of report.json.
+            data: Contents of the JSON file.
+            data_name: The JSON file's name.
 
         Raises:
             InputError: The files cannot be written.
         """
         with OutputFolder(out) as folder:
-            write_json(folder.staging / "report.json", data)
+            write_json(folder.staging / data_name, data)
             write_text(folder.staging / "index.html", self.html())
             for figure in self.figures():
                 write_bytes(folder.staging / f"{figure.name}.png", figure.png)

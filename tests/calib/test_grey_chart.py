@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from calib.commands import app
-from calib.grey_chart import grey_charts, histograms, measure
+from calib.grey_chart import GREYS, AngleRange, grey_charts, histograms, measure, write_lut
 from runtime.config import StackGeometry
 from runtime.panels.lut import measured_curve
 from tests.calib.simulator import Camera, camera_from_stack, ideal_panel, photograph
@@ -69,3 +69,16 @@ def test_a_wrong_exposure_is_told(gain: float, why: str) -> None:
     (picture,) = photographs(phase_of, count=1, gain=gain)
     with pytest.raises(match=why):
         histograms(picture, STACK, PANEL, source="p")
+
+
+def test_a_panel_whose_angles_are_known_turns_by_the_angles_asked_for(tmp_path: Path) -> None:
+    black_deg, white_deg = 4.0, 78.0
+
+    def turned_deg(grey: np.ndarray) -> np.ndarray:
+        return black_deg + (white_deg - black_deg) * phase_of(grey)
+
+    light = np.sin(np.radians(turned_deg(np.array(GREYS) / 255))) ** 2
+    write_lut(tmp_path / "lut.csv", (light - light[0]) / (light[-1] - light[0]), AngleRange(black_deg, white_deg))
+    asked_deg = np.linspace(0, 90, 256)
+    shown_deg = turned_deg(measured_curve(tmp_path / "lut.csv")[:, 1].astype(float))
+    assert np.abs(shown_deg - asked_deg.clip(black_deg, white_deg)).max() < 0.5

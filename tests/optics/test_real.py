@@ -18,6 +18,7 @@ from runtime.optics.real.cells import (
     Kind,
     crossed_intensity,
     retarder,
+    retarder_between_quarter_waves,
     rotator,
     twisted_nematic,
 )
@@ -174,7 +175,7 @@ def test_glass_shortens_the_gap_by_snells_law() -> None:
 
 
 def test_a_shifted_panel_shows_other_pixels() -> None:
-    moved = RealPanels(mounting=(Placement(), Placement(), Placement(right_mm=1.5, up_mm=0.75)))
+    moved = RealPanels(placement=(Placement(), Placement(), Placement(right_mm=1.5, up_mm=0.75)))
     ideal, real = (crossings(MIDDLE, CENTRE, STACK, panels, random()) for panels in (RealPanels(), moved))
     assert (real.u - ideal.u)[:, 0] == pytest.approx([0, 0, -2])
     assert (real.v - ideal.v)[:, 0] == pytest.approx([0, 0, 1])
@@ -182,7 +183,7 @@ def test_a_shifted_panel_shows_other_pixels() -> None:
 
 def test_roll_scale_and_depth_move_pixels_as_geometry_says() -> None:
     through = np.array([[0.0, 0.03, 0.01]])
-    real = RealPanels(mounting=(Placement(roll_mrad=10, scale=1.01), Placement(), Placement(depth_mm=1.0)))
+    real = RealPanels(placement=(Placement(roll_mrad=10, scale=1.01), Placement(), Placement(depth_mm=1.0)))
     crossed = crossings(MIDDLE, through, STACK, real, random())
     rear = np.array([0.03, 0.01]) * 0.63 / 0.6
     turn = np.array([[math.cos(0.01), math.sin(0.01)], [-math.sin(0.01), math.cos(0.01)]])
@@ -194,7 +195,7 @@ def test_roll_scale_and_depth_move_pixels_as_geometry_says() -> None:
 
 def test_a_sloping_panel_is_met_where_its_plane_is() -> None:
     through = np.array([[0.0, 0.03, 0.01]])
-    real = RealPanels(mounting=(Placement(), Placement(slope_right_mrad=50.0, slope_up_mrad=-20.0), Placement()))
+    real = RealPanels(placement=(Placement(), Placement(slope_right_mrad=50.0, slope_up_mrad=-20.0), Placement()))
     crossed = crossings(MIDDLE, through, STACK, real, random())
     y, z = (crossed.u[1, 0] / 160 - 0.5) * 0.12, (0.5 - crossed.v[1, 0] / 120) * 0.09
     x = 0.05 * y - 0.02 * z
@@ -296,3 +297,9 @@ def test_a_late_front_panel_costs_light_only_when_the_head_moves() -> None:
 def test_entries_that_do_not_fit_the_stack_are_refused() -> None:
     with pytest.raises(ValueError, match=r"panels\.cells: must have 1 or 3 entries, but has 2"):
         real_light(smooth_layers(), STACK, RealPanels(cells=(Cell(), Cell())), sight(), RealSampling())
+
+
+def test_a_variable_retarder_between_quarter_wave_plates_is_a_rotator() -> None:
+    angles = np.linspace(0.0, math.pi / 2, 7)
+    rest = retarder_between_quarter_waves(angles) @ rotator(-angles)
+    assert np.abs(rest / rest[:, :1, :1] - np.eye(2)).max() < 1e-9

@@ -24,7 +24,8 @@ DESIGN_NM = 540.0  # wavelength that cells are made for
 FIRST_MINIMUM = math.sqrt(3.0)  # Mauguin parameter of the first Gooch-Tarry minimum
 STEPS = 4  # entries of a table per 8-bit code
 
-Kind = Literal["rotator", "twisted-nematic", "half-wave"]
+Curve = Literal["linear", "intensity", "angle"]
+Kind = Literal["rotator", "twisted-nematic", "half-wave", "variable-retarder"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +39,7 @@ class Cell:
     kind: Kind = "rotator"
     white_deg: float = 90.0  # rotation at full white
     black_deg: float = 0.0  # rotation at black
+    curve: Curve = "linear"  # how panel values become angles (`angles_rad`)
     gamma_ratio: float = 1.0  # true exponent of the grey curve divided by the assumed one
     bits: int = 8  # grey levels: 2**bits
     mauguin: float = FIRST_MINIMUM  # 2·d·Δn/λ of a twisted nematic cell without voltage, at DESIGN_NM
@@ -57,7 +59,12 @@ class Cell:
         return self.kind == "rotator" and self.retardance_nm == 0.0
 
     def angles_rad(self) -> F64:
-        """Return the rotation for each entry of the table, from panel value 0 to 1."""
+        """Return the rotation for each entry of the table, from panel value 0 to 1.
+
+        A linear curve is that of a panel whose full range is taken for 0 to 90 degrees. Calibrated by intensity, black
+        and full white are taken for 0 and 90 degrees, and the intensities between them are right. Calibrated by angle,
+        every angle within the panel's range is right, and others are clipped.
+        """
         values = np.linspace(0.0, 1.0, 255 * STEPS + 1)
         if self.inverted:
             values = 1.0 - values
@@ -65,7 +72,13 @@ class Cell:
             levels = 2**self.bits - 1
             values = np.rint(values * levels) / levels
         shown = values**self.gamma_ratio
-        return np.asarray(np.radians(self.black_deg + (self.white_deg - self.black_deg) * shown))
+        black, white = math.radians(self.black_deg), math.radians(self.white_deg)
+        if self.curve == "angle":
+            return np.asarray((shown * math.pi / 2).clip(black, white))
+        if self.curve == "intensity":
+            low, high = math.sin(black) ** 2, math.sin(white) ** 2
+            return np.asarray(np.arcsin(np.sqrt(low + (high - low) * np.sin(shown * math.pi / 2) ** 2)))
+        return np.asarray(black + (white - black) * shown)
 
     def jones(self) -> C128:
         """Return the Jones matrices, shape (1021, 3, 2, 2): panel values by bands (`BANDS_NM`)."""
@@ -76,11 +89,12 @@ class Cell:
     def _jones(self, angles_rad: F64, wavelength_nm: float) -> C128:
         if self.kind == "rotator":
             cell = rotator(angles_rad)
+        elif self.kind == "variable-retarder":
+            cell = retarder_between_quarter_waves(angles_rad, DESIGN_NM / wavelength_nm)
         elif self.kind == "half-wave":
             cell = retarder(math.pi * DESIGN_NM / wavelength_nm, angles_rad / 2)
         else:
-            retardances = twisted_retardance(angles_rad, self.mauguin) * (DESIGN_NM / wavelength_nm)
-            cell = twisted_nematic(math.pi / 2, retardances)
+            cell = twisted_nematic(math.pi / 2, twisted_retardance(angles_rad, self.mauguin, wavelength_nm))
         if self.retardance_nm == 0.0:
             return cell
         delta = 2 * math.pi * self.retardance_nm / wavelength_nm
@@ -108,6 +122,21 @@ def retarder(delta_rad: ArrayLike, axis_rad: ArrayLike) -> C128:
     return np.asarray(np.stack(rows, -2))
 
 
+def retarder_between_quarter_waves(angle_rad: ArrayLike, dispersion: float = 1.0) -> C128:
+    """Return the matrices (..., 2, 2) of variable retarders at 0 degrees between quarter-wave plates at ±45 degrees.
+
+    This is how a cell with vertical or parallel alignment becomes a rotator: a retardance of twice the angle turns
+    any polarization by the angle, without residue where the plates are exact. The cell's own dispersion is left out
+    because its grey curve is calibrated in each band.
+
+    Args:
+        angle_rad: Rotation wanted, half of the cell's retardance.
+        dispersion: The plates' retardance, divided by a quarter wave.
+    """
+    first, last = (retarder(math.pi / 2 * dispersion, side * math.pi / 4) for side in (1, -1))
+    return np.asarray(last @ retarder(2 * np.asarray(angle_rad, np.float64), 0.0) @ first)
+
+
 def twisted_nematic(twist_rad: ArrayLike, beta_rad: ArrayLike) -> C128:
     """Return the matrices (..., 2, 2) of uniformly twisted cells whose entrance director is along x.
 
@@ -123,21 +152,24 @@ def twisted_nematic(twist_rad: ArrayLike, beta_rad: ArrayLike) -> C128:
     return np.asarray(rotator(twist) @ np.stack(rows, -2))
 
 
-def twisted_retardance(angles_rad: F64, mauguin: float) -> F64:
+def twisted_retardance(angles_rad: F64, mauguin: float, wavelength_nm: float) -> F64:
     """Return the half-retardances beta of a cell with a twist of 90 degrees, for each panel value.
 
-    The voltages are those at which a cell at the first Gooch-Tarry minimum has the intensities of the grey curve,
-    between crossed polarizers at `DESIGN_NM`. A cell with half-retardance beta transmits 1 - (twist·sin(gamma)/gamma)²
-    there, with gamma² = twist² + beta². A cell of another thickness has a retardance in proportion to it.
+    The voltages are those at which a cell at the first Gooch-Tarry minimum (at `DESIGN_NM`) has the intensities of the
+    grey curve between crossed polarizers, calibrated in this band. A cell with half-retardance beta transmits
+    1 - (twist·sin(gamma)/gamma)² there, with gamma² = twist² + beta². A cell of another thickness has a retardance in
+    proportion to it.
 
     Args:
         angles_rad: For each panel value, the angle whose sin² is the intensity of the grey curve.
-        mauguin: The cell's Mauguin parameter without voltage.
+        mauguin: The cell's Mauguin parameter without voltage, at `DESIGN_NM`.
+        wavelength_nm: The band's wavelength.
     """
-    betas = np.linspace(0.0, math.pi / 2 * FIRST_MINIMUM, 4096)
+    betas = np.linspace(0.0, math.pi / 2 * FIRST_MINIMUM * min(DESIGN_NM / wavelength_nm, 1.0), 4096)
     gamma = np.sqrt((math.pi / 2) ** 2 + betas**2)
     intensity = np.maximum.accumulate(1.0 - (math.pi / 2 * np.sinc(gamma / math.pi)) ** 2)
-    return np.asarray(np.interp(np.sin(angles_rad) ** 2, intensity, betas) * (mauguin / FIRST_MINIMUM))
+    wanted = np.sin(angles_rad) ** 2 * intensity[-1]
+    return np.asarray(np.interp(wanted, intensity, betas) * (mauguin / FIRST_MINIMUM))
 
 
 def crossed_intensity(matrix: C128) -> F64:

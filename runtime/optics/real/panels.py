@@ -78,10 +78,10 @@ class Timing:
 
 @dataclass(frozen=True, slots=True)
 class RealPanels:
-    """A stack of real panels. Each of `cells` and `mounting` has one entry for all panels, or one for each."""
+    """A stack of real panels. Each of `cells` and `placement` has one entry for all panels, or one for each."""
 
     cells: tuple[Cell, ...] = (Cell(),)
-    mounting: tuple[Placement, ...] = (Placement(),)
+    placement: tuple[Placement, ...] = (Placement(),)
     optics: Optics = field(default_factory=Optics)
     lighting: Lighting = field(default_factory=Lighting)
     timing: Timing = field(default_factory=Timing)
@@ -91,13 +91,13 @@ class RealPanels:
         """Return a panel's cell. Panels are numbered from the rear."""
         return _of(self.cells, index)
 
-    def mounted(self, index: int) -> Placement:
+    def placed(self, index: int) -> Placement:
         """Return a panel's deviation from its assumed place."""
-        return _of(self.mounting, index)
+        return _of(self.placement, index)
 
     def check(self, count: int) -> None:
         """Raise ValueError, naming the field, if an entry's length does not fit a stack of `count` panels."""
-        lengths = {"cells": len(self.cells), "mounting": len(self.mounting)}
+        lengths = {"cells": len(self.cells), "placement": len(self.placement)}
         for name, length in lengths.items():
             if length not in (1, count):
                 raise ValueError(f"panels.{name}: must have 1 or {count} entries, but has {length}")

@@ -53,7 +53,7 @@ def crossings(
     u, v, slope = np.empty((count, rays)), np.empty((count, rays)), np.empty((count, 2, rays))
     optics = real.optics
     for n in reversed(range(count)):
-        mounted = real.mounted(n)
+        mounted = real.placed(n)
         plane = stack.x_m[n] + mounted.depth_mm / 1e3
         sides = 1 if n == count - 1 else 2
         if optics.reflectance and n < count - 1:
@@ -155,6 +155,9 @@ class Tables:
             self._jones[-1] = np.asarray(axis @ self._jones[-1], np.complex64)
         self._blocked = np.float32(black_level(cells, real.lighting.polarizer_contrast))
         self._moments = moments(stack, real.timing)
+        self._full = np.ones(3, np.float32)
+        if self._angles is None:
+            self._full = self._full_white()
 
     def light(self, crossed: Crossings, eye_x_m: float) -> tuple[F32, F32]:
         """Return each ray's light (P, 3), and its light if all panels were white (P, 3) (or (1, 1), the same for all).
@@ -167,9 +170,21 @@ class Tables:
             (self._polarized(self._values(crossed, lags, eye_x_m)) for lags in self._moments),
             start=np.zeros((crossed.u.shape[1], 3), np.float32),
         ) / np.float32(len(self._moments))
-        share = self._blocked + (1 - self._blocked) * share
+        share = self._blocked + (1 - self._blocked) * share / self._full
         white = self._white(crossed)
         return np.asarray(white * share, np.float32), np.asarray(white, np.float32)
+
+    def _full_white(self) -> F32:
+        """Return the light (3,) in each band of values that add up to 1, full white on ideal panels.
+
+        The middle panel is at 0 and the others are equal, as the solver leaves them in uniform areas. Eyes adapt to a
+        tint, so light is relative to this white, unless it is less than half as bright as it should be.
+        """
+        count = self.stack.count
+        entry = round(255 * STEPS / (count - 1))
+        values = [np.full((1, 3), 0 if n == count // 2 else entry, np.int64) for n in range(count)]
+        full = self._polarized(values)[0]
+        return np.asarray(np.where(full > 0.5, full, 1.0), np.float32)
 
     def _values(self, crossed: Crossings, lags: Lags, eye_x_m: float) -> list[Ints]:
         """Return each panel's table entries (P, 3) at a moment of the refresh."""

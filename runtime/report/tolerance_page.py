@@ -1,0 +1,313 @@
+"""Run of `phasestack tolerance`: measures everything, and writes its page and tolerance.json as results come in."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from runtime.config import ModelSettings, load_settings
+from runtime.model.predictor import load_predictor
+from runtime.optics.quality import psnr_db
+from runtime.optics.real.panels import RealPanels
+from runtime.optics.stack import PanelStack
+from runtime.report.crosstalk import (
+    FALL_DB,
+    Crosstalk,
+    Patches,
+    freedom_with_tracking,
+    freedom_without_tracking,
+    reduced,
+    uniformity,
+)
+from runtime.report.page import Figure, Page, PageSection, Table, describe, drawing, png
+from runtime.report.pairs import PairPainter, StillPair, eyes_at, read_pairs
+from runtime.report.tolerance import (
+    IMPERFECTIONS,
+    PIXELS,
+    PIXELS_FIRST,
+    Bench,
+    Cost,
+    cell_at,
+    solved,
+    together,
+)
+
+SCENE, DISTANCE_M, HEIGHT_M = "room", 0.6, 0.03  # content and head position without --pairs
+BACKLIGHT_FALLOFF = 0.2
+Progress = Callable[[str], None]
+NOTE = (
+    "No real stack has been measured. The figures come from a simulator of real panels that leaves out oblique "
+    "incidence in the cells, coherent effects between panels, spectra within a band and temperature (docs/planning.md)."
+)
+
+
+class ToleranceRun:
+    """A run's results so far. Every new part is written to the folder, if there is one."""
+
+    def __init__(self, out: Path | None, command: str, progress: Progress) -> None:
+        self._out, self._command, self._progress = out, command, progress
+        self._sections: dict[str, PageSection] = {}
+        self.record: dict[str, Any] = {"complete": False}
+        self._begun_s = time.perf_counter()
+
+    def run(self, config: Path | None, pairs: Path | None) -> dict[str, Any]:
+        """Measure everything, and return the contents of tolerance.json.
+
+        Raises:
+            InputError: The configuration or the pairs cannot be used.
+            MissingPart: Without pairs, a scene must be drawn, and OpenGL is missing.
+        """
+        self._progress("drawing the pictures")
+        stack = load_settings(config).stack.stack()
+        subjects_pairs = read_pairs(pairs) if pairs else [scene_pair(stack)]
+        stack = subjects_pairs[0].stack
+        self._progress("solving")
+        bench = Bench([solved(pair) for pair in subjects_pairs])
+        self.record |= {"ideal_db": bench.ideal_db, "stack": geometry(stack), "pairs": [p.name for p in subjects_pairs]}
+        self._measure_costs(bench, stack, first=True)
+        self._measure_compensation(bench)
+        self._measure_crosstalk(stack, subjects_pairs[0])
+        self._measure_costs(bench, stack, first=False)
+        self._measure_freedom(bench, stack, drawn=pairs is None)
+        self.record |= {"complete": True, "seconds": time.perf_counter() - self._begun_s, "machine": describe()}
+        self._write()
+        return self.record
+
+    def _measure_costs(self, bench: Bench, stack: PanelStack, *, first: bool) -> None:
+        costs: list[Cost] = []
+        for cost in bench.first(IMPERFECTIONS) if first else bench.curves(IMPERFECTIONS):
+            costs.append(cost)
+            self._progress(f"{'first look' if first else 'curves'}: {cost.imperfection.name} ({len(costs)}"
+                           f"/{len(IMPERFECTIONS)})")  # fmt: skip
+        pixels = PIXELS_FIRST if first else PIXELS
+        self._progress("all imperfections together")
+        assumed_db, brightness = bench.light(lambda s: together(IMPERFECTIONS, s, left=False), pixels)
+        left_db, left_brightness = bench.light(lambda s: together(IMPERFECTIONS, s, left=True), pixels)
+        self.record["costs"] = [cost_entry(cost, bench.ideal_db) for cost in costs]
+        self.record["together"] = {
+            "assumed_db": assumed_db, "left_db": left_db,
+            "assumed_brightness": brightness, "left_brightness": left_brightness,
+        }  # fmt: skip
+        self._sections["costs"] = cost_section(costs, bench.ideal_db, self.record["together"], is_first=first)
+        self._write()
+
+    def _measure_compensation(self, bench: Bench) -> None:
+        self._progress("compensation")
+        rows: list[dict[str, Any]] = []
+        for name, before, after in compensations():
+            lights = [bench.light(partial(_always, panels), PIXELS)[0] for panels in (before, after)]
+            rows.append({"name": name, "before_db": lights[0], "after_db": lights[1]})
+        self.record["compensation"] = rows
+        shown = [(row["name"], row["before_db"], row["after_db"]) for row in rows]
+        table = Table(
+            ["panels", "without the angles, dB", "with the angles, dB", "gained, dB"],
+            [[name, f"{before:.2f}", f"{after:.2f}", f"{after - before:.2f}"] for name, before, after in shown],
+        )
+        self._sections["compensation"] = PageSection(
+            "Compensation",
+            ["calibrate grey takes black and full white for 0 and 90 degrees unless it is given the angles. With the "
+             "angles, every rotation within the panel's range is right."],
+            tables=[table],
+        )  # fmt: skip
+        self._write()
+
+    def _measure_crosstalk(self, stack: PanelStack, pair: StillPair) -> None:
+        small = reduced(stack)
+        predictor = load_predictor("balanced", small, ModelSettings(backend="cpu"))
+        try:
+            patches = Patches(small, pair.eyes_m, predictor)
+            sizes, disparities = [], []
+            for found in patches.sizes():
+                sizes.append(found)
+                self._progress(f"crosstalk: a patch of {found.patch_mm:.0f} mm")
+            for found in patches.disparities():
+                disparities.append(found)
+                self._progress(f"crosstalk: a disparity of {found.disparity_mm:.0f} mm")
+        finally:
+            predictor.close()
+        self.record["crosstalk"] = [asdict(found) for found in sizes]
+        self.record["crosstalk_disparity"] = [asdict(found) for found in disparities]
+        self.record["full_field_crosstalk_percent"] = sizes[-1].percent
+        self.record["luminance_uniformity"] = uniformity(BACKLIGHT_FALLOFF)
+        self._sections["crosstalk"] = crosstalk_section(sizes, disparities)
+        self._write()
+
+    def _measure_freedom(self, bench: Bench, stack: PanelStack, *, drawn: bool) -> None:
+        subject = bench.subjects[0]
+        self._progress("viewing freedom without tracking")
+        still = freedom_without_tracking(subject.pair, subject.layers)
+        followed = []
+        if drawn:
+            for place in freedom_with_tracking(stack, SCENE, lambda pair: psnr_db(solved(pair).ideal_error)):
+                followed.append(place)
+                self._progress(
+                    f"viewing freedom with tracking: {place['distance_m']} m, {place['angle_deg']:g} degrees"
+                )
+        self.record["viewing_freedom"] = {"without_tracking": still, "with_tracking": followed}
+        self._sections["freedom"] = freedom_section(still, followed)
+
+    def _write(self) -> None:
+        if self._out is None:
+            return
+        done = self.record["complete"]
+        notes = [NOTE] if done else ["This page is not finished; results are added as they come in.", NOTE]
+        lead = f"Light on ideal panels: {self.record['ideal_db']:.1f} dB, at a tracking error of 1 mm."
+        if found := self.record.get("together"):
+            lead += f" As ordered and mounted by hand: {found['assumed_db']:.1f} dB."
+            lead += f" After calibration, with the panels recommended below: {found['left_db']:.1f} dB."
+        sections = [self._sections[name] for name in ORDER if name in self._sections]
+        page = Page("What real panels would show", lead, sections, describe(), self._command, notes)
+        page.write(self._out, data=self.record, data_name="tolerance.json")
+
+
+ORDER = ("costs", "compensation", "crosstalk", "freedom")
+
+
+def scene_pair(stack: PanelStack) -> StillPair:
+    """Draw the built-in scene for a viewer in front of the stack."""
+    with PairPainter(SCENE, stack) as painter:
+        eyes_m = eyes_at(distance_m=DISTANCE_M, height_m=HEIGHT_M)
+        return painter.pair(f"{SCENE}, {DISTANCE_M:g} m", eyes_m, off_mm=())
+
+
+def _always(panels: RealPanels, _: PanelStack) -> RealPanels:
+    return panels
+
+
+def geometry(stack: PanelStack) -> dict[str, Any]:
+    """Return a stack's geometry as entries for tolerance.json."""
+    names = ("width_m", "height_m", "x_m", "width_px", "height_px")
+    return {name: getattr(stack, name) for name in names}
+
+
+def compensations() -> list[tuple[str, RealPanels, RealPanels]]:
+    """Return compensations as name, panels before and panels after."""
+    rows = []
+    for white, black in ((85.0, 0.0), (80.0, 0.0), (70.0, 0.0), (90.0, 2.0), (90.0, 6.0), (80.0, 4.0)):
+        before = RealPanels(cells=(cell_at(white, black, "intensity"),))
+        after = RealPanels(cells=(cell_at(white, black, "angle"),))
+        rows.append((f"full white {white:g} degrees, black {black:g} degrees", before, after))
+    return rows
+
+
+def cost_entry(cost: Cost, ideal_db: float) -> dict[str, Any]:
+    """Return an imperfection's entry for tolerance.json."""
+    one = cost.imperfection
+    return {
+        "name": one.name, "unit": one.unit, "sizes": one.sizes if cost.light_db else [], "light_db": cost.light_db,
+        "costs_1_db_at": cost.costs_1_db_at(ideal_db), "assumed": one.assumed,
+        "assumed_costs_db": ideal_db - cost.assumed_db, "remedy": one.remedy, "left_costs_db": ideal_db - cost.left_db,
+        "brightness": cost.brightness, "note": one.note,
+    }  # fmt: skip
+
+
+def cost_section(costs: Sequence[Cost], ideal_db: float, all_db: dict[str, float], *, is_first: bool) -> PageSection:
+    """Return the table of imperfections, sorted by cost, with their curves."""
+    ordered = sorted(costs, key=lambda cost: cost.assumed_db)
+    rows = []
+    for cost in ordered:
+        one = cost.imperfection
+        at = cost.costs_1_db_at(ideal_db)
+        after = f"{ideal_db - cost.left_db:.1f}" if one.remedy else ""
+        rows.append([
+            one.name, f"{one.assumed:g} {one.unit}".strip(), f"{ideal_db - cost.assumed_db:.1f}",
+            "" if at is None else f"{at:.2g} {one.unit}", one.remedy, after, one.note,
+        ])  # fmt: skip
+    headings = ["imperfection", "assumed", "costs, dB", "costs 1 dB at", "remedy", "then costs, dB", "note"]
+    text = [
+        "Each imperfection alone, on layers computed for ideal panels. Shifts and the like concern the front panel "
+        "only; all others concern every panel. Light is measured as in solve.json, with the same rays with and without "
+        "the imperfection, at about "
+        f"{PIXELS_FIRST if is_first else PIXELS} pixels of each picture at the panels' full resolution.",
+        f"All together as assumed: {all_db['assumed_db']:.1f} dB, with {100 * all_db['assumed_brightness']:.1f} % of "
+        f"the brightness of ideal panels. With all remedies: {all_db['left_db']:.1f} dB, with "
+        f"{100 * all_db['left_brightness']:.1f} %. Costs do not add up.",
+    ]
+    figures = [] if is_first else [cost_figure(ordered, ideal_db)]
+    return PageSection("Tolerances", text, figures, [Table(headings, rows)])
+
+
+def cost_figure(costs: Sequence[Cost], ideal_db: float) -> Figure:
+    """Plot light against the size of each imperfection."""
+    columns = 4
+    rows = math.ceil(len(costs) / columns)
+    lowest = max(min(min(cost.light_db) for cost in costs), 5.0)
+    with drawing(12.0, 2.5 * rows) as figure:
+        grid = figure.subplots(rows, columns, squeeze=False, sharey=True)
+        for axes, cost in zip(grid.flat, costs, strict=False):
+            one = cost.imperfection
+            if one.unit:
+                axes.plot(one.sizes, cost.light_db, "o-", markersize=3.5)
+                axes.axvline(one.assumed, color="C1", linewidth=1, linestyle="--")
+            else:
+                colours = ["C1" if size == one.assumed else "C0" for size in one.sizes]
+                axes.bar(one.sizes, cost.light_db, color=colours, width=0.6)
+                axes.set_xticks(one.sizes)
+            axes.axhline(ideal_db - 1, color="grey", linewidth=0.8, linestyle=":")
+            axes.set_ylim(lowest - 1, ideal_db + 1.5)
+            axes.set_title(one.name, fontsize=9)
+            axes.set_xlabel(one.unit or "choice", fontsize=8)
+            axes.tick_params(labelsize=8)
+        for axes in grid.flat[len(costs) :]:
+            axes.set_axis_off()
+        for row in grid:
+            row[0].set_ylabel("light, dB", fontsize=8)
+        told = "Dotted: 1 dB below ideal panels. Orange: as assumed."
+        return Figure("costs", png(figure), told)
+
+
+def crosstalk_section(sizes: Sequence[Crosstalk], disparities: Sequence[Crosstalk]) -> PageSection:
+    """Return the crosstalk curves."""
+    with drawing(10.0, 3.8) as figure:
+        axes = figure.subplots(1, 2, sharey=True)
+        groups = (
+            (sizes, [c.patch_mm for c in sizes], "size of a patch that one eye sees, mm"),
+            (disparities, [c.disparity_mm or 0.0 for c in disparities], "disparity of a patch 60 mm wide, mm"),
+        )
+        for plot, (found, at, label) in zip(axes, groups, strict=True):
+            plot.semilogx(at, [c.percent for c in found], "o-", label="solved")
+            if found[0].theory_percent is not None:
+                plot.semilogx(at, [c.theory_percent for c in found], "x--", color="C1", label="theory")
+            plot.xaxis.set_major_formatter("{x:g}")
+            plot.set_xlabel(label)
+        axes[0].set_ylabel("crosstalk, %")
+        axes[0].legend()
+        picture = Figure("crosstalk", png(figure), "Crosstalk on ideal panels, at a tracking error of 1 mm.")
+    text = [
+        "Crosstalk is the luminance that the wrong eye sees, divided by that for the right eye; both less black, which "
+        "is 0 here. IEC 62629-22-1 and the IDMS measure it with patches that fill the display: white for one eye and "
+        f"black for the other. By that measure it is {sizes[-1].percent:.0f} %. This kind of display cannot show large areas "
+        "that differ between the eyes. What scenes in depth need are differences as wide as their disparity.",
+        f"Luminance uniformity at nine points, for a backlight {100 * BACKLIGHT_FALLOFF:.0f} % darker in the corners: "
+        f"{100 * uniformity(BACKLIGHT_FALLOFF):.0f} % (lowest / highest). The layers do not change it.",
+    ]
+    rows = [[f"{c.patch_mm:.0f} mm, one eye", f"{c.percent:.1f}", _percent(c.theory_percent)] for c in sizes]
+    rows += [
+        [f"disparity {c.disparity_mm:.0f} mm", f"{c.percent:.1f}", _percent(c.theory_percent)] for c in disparities
+    ]
+    return PageSection("Crosstalk", text, [picture], [Table(["patch", "crosstalk, %", "theory, %"], rows)])
+
+
+def _percent(value: float | None) -> str:
+    return "" if value is None else f"{value:.1f}"
+
+
+def freedom_section(still: dict[str, Any], followed: Sequence[dict[str, float]]) -> PageSection:
+    """Return the region in which light stays good, with and without tracking."""
+    rows = []
+    for name, found in still.items():
+        falls = found["falls_3_db_at_mm"]
+        rows.append([name, f"more than {found['mm'][-1]:g}" if falls is None else f"{falls:.1f}"])
+    tables = [Table(["the head moves", f"light falls by {FALL_DB:g} dB at, mm"], rows, "Without tracking")]
+    if followed:
+        places = [[f"{f['distance_m']:g} m, {f['angle_deg']:g} degrees", f"{f['light_db']:.1f}"] for f in followed]
+        tables.append(Table(["head", "light, dB"], places, "With tracking: layers computed for each place"))
+    text = [
+        "Without tracking, the eyes must stay close to where the layers were computed for. Tracking frees the head."
+    ]
+    return PageSection("Viewing freedom", text, tables=tables)
