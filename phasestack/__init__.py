@@ -12,6 +12,8 @@ from runtime.errors import SensorLost, SensorTimeout
 from runtime.evaluation.solved import PairQuality
 from runtime.evaluation.solved import PairQuality as Quality
 from runtime.eyes.pupils import Pupils
+from runtime.optics.real.cells import Cell
+from runtime.optics.real.panels import Lighting, Optics, Placement, RealPanels, Timing
 from runtime.records import EyePoints, SensorFrame
 from runtime.sensor.base import Capabilities, DeviceClock, Sensor
 from runtime.support.version import version
@@ -21,21 +23,27 @@ __version__ = version()
 __all__ = [
     "Cameras",
     "Capabilities",
+    "Cell",
     "ContentSource",
     "DeviceClock",
     "ExamplePair",
     "EyePoints",
     "Eyes",
+    "Lighting",
     "Measuring",
+    "Optics",
     "PairQuality",
+    "Placement",
     "Pupils",
     "Quality",
+    "RealPanels",
     "Result",
     "Sensor",
     "SensorFrame",
     "SensorLost",
     "SensorTimeout",
     "Stack",
+    "Timing",
     "__version__",
     "camera",
     "evaluate",

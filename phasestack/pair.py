@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import math
 import os
 import sys
 import tempfile
@@ -10,7 +11,7 @@ import time
 import warnings
 import webbrowser
 from collections.abc import Iterable, Iterator, Sequence, Sized
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from itertools import combinations
 from pathlib import Path
@@ -30,6 +31,8 @@ from runtime.model.predictor import Predictor, load_predictor
 from runtime.model.still import solve_still
 from runtime.optics.cameras import as_cameras, doubts, looking_at_origin
 from runtime.optics.disparity import disparity_doubts
+from runtime.optics.real.light import RealSampling, Sight, real_light
+from runtime.optics.real.panels import RealPanels
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack
@@ -40,6 +43,7 @@ from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG, SEPARATION_MIN_M, 
 
 EVERY_LEAST = 20  # minimum number of pixels to sample along a picture's shorter side
 LEAST_APART_M = 0.0005  # minimum distance between two views' eyes if there are more than two
+REAL_PIXELS = 20_000  # pixels of a picture that are measured on real panels, about
 SAME_PLACE_M = 0.001  # maximum distance between an eye and its camera
 _one_at_a_time = Lock()  # a loaded model reuses its buffers
 
@@ -285,6 +289,7 @@ def evaluate(
     eyes_m: Eyes | None = None,
     fov_deg: float = 40.0,
     cameras: Cameras | None = None,
+    panels: RealPanels | None = None,
     **how: Unpack[Measuring],
 ) -> PairQuality:
     """Measure how well any layers show each eye its picture.
@@ -299,6 +304,8 @@ def evaluate(
         eyes_m: Eye positions, as in `solve`.
         fov_deg: The pictures' horizontal field of view, in degrees.
         cameras: The pictures' cameras, as in `solve`.
+        panels: Imperfections of real panels. Only `light_db` is then measured, for a tracking error of 1 mm and at some
+            20,000 pixels unless `how` says otherwise; the other figures are NaN.
         **how: Options that make the measurement faster. `evaluate(..., sigmas_mm=(1,), every=4)` measures only a
         tracking error of 1 mm, at every 4th pixel of every 4th row, and also gives the light PSNR's standard error.
         SSIM is then NaN.
@@ -320,7 +327,27 @@ def evaluate(
             "by pi/2"
         )
     codes = [as_codes(as_picture(f"layers[{n}]", layer[..., :3])) for n, layer in enumerate(given)]
+    if panels is not None:
+        return _on_real_panels(pair, np.stack(codes), panels, how)
     return _measured(pair.judged(np.stack(codes)), how)
+
+
+def _on_real_panels(pair: _Pair, layers: U8, panels: RealPanels, how: Measuring) -> PairQuality:
+    """Measure the light of layers on real panels. Raises as `_options` does, and if the panels do not fit the stack."""
+    if not isinstance(panels, RealPanels):
+        raise ValueError(f"panels: must be phasestack.RealPanels, not {type(panels).__name__}")
+    height, width = pair.pictures[0].shape[:2]
+    usual: Measuring = {"sigmas_mm": (1.0,), "every": max(1, round(math.sqrt(height * width / REAL_PIXELS)))}
+    sigmas, every = _options(pair.pictures, usual | how)
+    sight = Sight(pair.eyes_m, pair.pictures, pair.fov_deg)
+    light = {
+        f"{sigma:g}": real_light(
+            layers, pair.stack, panels, replace(sight, sigma_mm=sigma), RealSampling(step=every)
+        ).light_db
+        for sigma in sigmas
+    }
+    unknown = tuple(math.nan for _ in pair.eyes_m)
+    return PairQuality(light, {}, math.nan, math.nan, unknown)
 
 
 def _measured(pair: SolvedPair, how: Measuring) -> PairQuality:
@@ -334,14 +361,20 @@ def _measured(pair: SolvedPair, how: Measuring) -> PairQuality:
         raise TypeError(f"{unknown[0]}: unknown argument; use {' or '.join(Measuring.__annotations__)}")
     if not how:
         return pair.quality
+    sigmas, every = _options(pair.pictures, how)
+    return pair.sampled(sigmas_mm=sigmas, every=every)
+
+
+def _options(pictures: Sequence[Picture], how: Measuring) -> tuple[list[float], int]:
+    """Return the tracking errors and the step between measured pixels. Raises ValueError if one is out of range."""
     sigmas_mm, every = how.get("sigmas_mm", SIGMAS_MM), how.get("every", 1)
     if not isinstance(sigmas_mm, Sequence) or not sigmas_mm:
         raise ValueError(f"sigmas_mm: must be a sequence of tracking errors in mm such as (1,), not {sigmas_mm!r}")
     sigmas = [_number("sigmas_mm", sigma_mm, 0.0, 1000.0, "mm") for sigma_mm in sigmas_mm]
-    most = min(pair.pictures[0].shape[:2]) // EVERY_LEAST
+    most = min(pictures[0].shape[:2]) // EVERY_LEAST
     if isinstance(every, bool) or not isinstance(every, int | np.integer) or not 1 <= every <= most:
         raise ValueError(f"every: must be a whole number of pixels from 1 to {most}, not {every!r}")
-    return pair.sampled(sigmas_mm=sigmas, every=int(every))
+    return sigmas, int(every)
 
 
 def camera(eye_m: Sequence[float] | F64, *, width_px: int, height_px: int, fov_deg: float = 40.0) -> F64:

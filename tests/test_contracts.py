@@ -23,6 +23,8 @@ from runtime.model.contract import METADATA_KEY, Contract
 from runtime.report.frontier import MethodResult
 from runtime.report.pairs import read_pairs
 from runtime.report.stability.trial import Case
+from runtime.report.tolerance import IMPERFECTIONS, Cost
+from runtime.report.tolerance_page import cost_entry
 from runtime.support.artifacts import write_png
 from tests.eyes.scene import eileen
 from tests.test_cli import pair_in, solve_arguments
@@ -84,6 +86,8 @@ def test_solve_leaves_every_file_and_every_field(tmp_path: Path, capsys: pytest.
 
 def test_reports_have_every_field() -> None:
     assert fields_of("field of a method in report.json") <= {field.name for field in fields(MethodResult)}
+    cost = Cost(IMPERFECTIONS[0], [30.0] * len(IMPERFECTIONS[0].sizes))
+    assert fields_of("field of a cost in tolerance.json") <= cost_entry(cost, 30.0).keys()
     assert fields_of("field of a case in stability.json") <= {field.name for field in fields(Case)}
 
 

@@ -281,8 +281,8 @@ def crosstalk_section(sizes: Sequence[Crosstalk], disparities: Sequence[Crosstal
     text = [
         "Crosstalk is the luminance that the wrong eye sees, divided by that for the right eye; both less black, which "
         "is 0 here. IEC 62629-22-1 and the IDMS measure it with patches that fill the display: white for one eye and "
-        f"black for the other. By that measure it is {sizes[-1].percent:.0f} %. This kind of display cannot show large areas "
-        "that differ between the eyes. What scenes in depth need are differences as wide as their disparity.",
+        f"black for the other. By that measure it is {sizes[-1].percent:.0f} %. This kind of display cannot show large "
+        "areas that differ between the eyes. What scenes in depth need are differences as wide as their disparity.",
         f"Luminance uniformity at nine points, for a backlight {100 * BACKLIGHT_FALLOFF:.0f} % darker in the corners: "
         f"{100 * uniformity(BACKLIGHT_FALLOFF):.0f} % (lowest / highest). The layers do not change it.",
     ]

@@ -24,13 +24,13 @@ SETS = 2  # independent sets of rays; the squared error is the product of their 
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """Targets for two eyes, and the eyes' positions."""
+    """Targets for the viewers' eyes, and the eyes' positions."""
 
-    eyes_m: F64  # (2, 3) eyes that the layers were solved for, frame `stack`
-    targets: tuple[U8 | F32, ...]  # (h, w, 3) the left and right eyes' pictures
+    eyes_m: F64  # (V, 3) eyes that the layers were solved for, frame `stack`
+    targets: tuple[U8 | F32, ...]  # (h, w, 3) the eyes' pictures
     fov_deg: float  # the pictures' horizontal field of view
     sigma_mm: float = 1.0  # standard deviation of the tracking error along each axis
-    seen_from_m: F64 | None = None  # (2, 3) true eyes; by default `eyes_m`
+    seen_from_m: F64 | None = None  # (V, 3) true eyes; by default `eyes_m`
 
 
 class RealSampling(NamedTuple):
@@ -89,8 +89,9 @@ def real_light(layers: U8, stack: PanelStack, real: RealPanels, sight: Sight, sa
         raise ValueError("no ray from these eyes crosses every panel")
     white = whites / counted
     total = 0.0
-    for start in range(0, len(views), 2):  # a move's two eyes
-        errors = [view.errors(white, real.lighting.veil) for _, view in views[start : start + 2]]
+    eyes = len(sight.eyes_m)
+    for start in range(0, len(views), eyes):  # all eyes of one move
+        errors = [view.errors(white, real.lighting.veil) for _, view in views[start : start + eyes]]
         total += views[start][0] * float(np.concatenate(errors).mean())
     mean = float(white.mean())
     tint = tuple(float(part) for part in white / mean)

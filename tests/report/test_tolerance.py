@@ -1,0 +1,123 @@
+"""Tests that `phasestack tolerance` measures costs, crosstalk and freedom, and that its figures follow from its law."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+import phasestack
+from runtime.commands.tolerance import tolerance
+from runtime.errors import InputError
+from runtime.optics.real.panels import Placement, RealPanels
+from runtime.optics.stack import PanelStack
+from runtime.report.crosstalk import parallax_m, theory_percent, uniformity
+from runtime.report.pairs import StillPair, eyes_at
+from runtime.report.tolerance import IMPERFECTIONS, Bench, Cost, Subject, merged, solved, together
+
+
+def command(*arguments: str) -> Any:
+    app = typer.Typer()
+    app.command()(tolerance)
+    return CliRunner().invoke(app, list(arguments))
+
+
+@pytest.fixture(scope="module")
+def subject() -> Subject:
+    pair = phasestack.example_pair()
+    return solved(StillPair("example", pair.stack, pair.eyes_m, (pair.left, pair.right), pair.fov_deg))
+
+
+def test_all_imperfections_begin_with_ideal_panels() -> None:
+    stack = PanelStack(0.5, 0.3, (-0.03, 0.0, 0.03), 64, 36)
+    for one in IMPERFECTIONS:
+        ideal = merged(RealPanels(), one.make(one.sizes[0], stack), stack.count)
+        assert ideal.cells == (RealPanels().cells[0],) * 3, one.name
+        assert ideal.placement == (Placement(),) * 3, one.name
+        assert ideal.timing.is_still, one.name
+
+
+def test_half_a_pixel_of_misalignment_costs_more_than_an_eighth(subject: Subject) -> None:
+    (shift,) = (one for one in IMPERFECTIONS if one.name == "shift of the front panel")
+    bench = Bench([subject])
+    eighth, half = (bench.light(lambda stack, size=size: shift.make(size, stack), 1500)[0] for size in (0.125, 0.5))  # type: ignore[misc]
+    assert bench.ideal_db > eighth > half + 1
+    measured = phasestack.evaluate(
+        subject.layers, *subject.pair.images, stack=subject.pair.stack, eyes_m=subject.pair.eyes_m,
+        fov_deg=subject.pair.fov_deg, panels=shift.make(0.5, subject.pair.stack), every=8,
+    )  # fmt: skip
+    assert measured.light_db["1"] == pytest.approx(half, abs=1.0)
+    assert math.isnan(measured.psnr_db)
+
+
+def test_ideal_panels_cost_nothing(subject: Subject) -> None:
+    bench = Bench([subject])
+    assert bench.light(lambda _: RealPanels(), 1500) == (pytest.approx(bench.ideal_db), 1.0)
+
+
+def test_a_remedy_gives_light_back(subject: Subject) -> None:
+    bench = Bench([subject])
+    for name in ("full white short of 90 degrees", "dark state that turns", "glass on each side of a panel"):
+        (one,) = (one for one in IMPERFECTIONS if one.name == name)
+        before = bench.light(lambda stack, one=one: one.make(one.assumed, stack), 1500)[0]  # type: ignore[misc]
+        assert bench.light(one.after, 1500)[0] > before + 1, name
+
+
+def test_the_size_that_costs_a_decibel_is_interpolated() -> None:
+    (shift,) = (one for one in IMPERFECTIONS if one.name == "shift of the front panel")
+    assert Cost(shift, [37.0, 36.9, 36.5, 35.5, 33.0, 30.0]).costs_1_db_at(37.0) == pytest.approx(0.375)
+    assert Cost(shift, [37.0, 36.9, 36.8, 36.8, 36.7, 36.7]).costs_1_db_at(37.0) is None
+
+
+def test_imperfections_together_keep_each_one() -> None:
+    stack = PanelStack(0.5, 0.3, (-0.03, 0.0, 0.03), 64, 36)
+    everything = together(IMPERFECTIONS, stack, left=False)
+    assert everything.placed(2).roll_mrad == 1.0
+    assert everything.placed(2).right_mm == pytest.approx(1.6 * 500 / 64)
+    assert everything.cell(0).kind == "twisted-nematic"
+    assert everything.cell(0).white_deg == 85.0
+    assert everything.optics.filters == (True, True, True)
+    assert everything.timing.response_ms == 2.5
+
+
+def test_patches_up_to_four_parallaxes_have_no_crosstalk_in_theory() -> None:
+    parallax = parallax_m(PanelStack(0.5, 0.3, (-0.03, 0.0, 0.03), 64, 36), eyes_at(distance_m=0.6))
+    assert parallax == pytest.approx(0.0315 * 0.03 / 0.6)
+    assert theory_percent(3.9 * parallax, parallax) == pytest.approx(0.0)
+    assert theory_percent(8 * parallax, parallax) == pytest.approx(100 * (1 - math.sqrt(0.5)) / (1 + math.sqrt(0.5)))
+    assert theory_percent(1000.0, parallax) > 95
+
+
+def test_uniformity_is_that_of_the_ninth_point() -> None:
+    assert uniformity(0.2) == pytest.approx(1 - 0.2 * 2 * 2 * 0.4**2)
+
+
+def test_bad_pairs_are_refused_before_anything_is_written(tmp_path: Path) -> None:
+    done = command("--pairs", str(tmp_path / "nowhere"), "--out", str(tmp_path / "out"))
+    assert isinstance(done.exception, InputError)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_a_run_leaves_its_page_and_figures(tmp_path: Path) -> None:
+    phasestack.example_pair().save(tmp_path / "pairs")
+    done = command("--pairs", str(tmp_path / "pairs"), "--out", str(tmp_path / "out"))
+    assert done.exit_code == 0, done.output
+    record = json.loads((tmp_path / "out" / "tolerance.json").read_text())
+    assert record["complete"]
+    for cost in record["costs"]:
+        assert {"name", "unit", "assumed", "assumed_costs_db"} <= cost.keys()
+        assert len(cost["sizes"]) == len(cost["light_db"])
+        assert cost["light_db"][0] == pytest.approx(record["ideal_db"])
+    percents = [found["percent"] for found in record["crosstalk"]]
+    assert percents[-1] > 80 > 20 > min(percents)
+    theory = [found["theory_percent"] for found in record["crosstalk"]]
+    assert np.corrcoef(percents, theory)[0, 1] > 0.95
+    assert "What real panels would show" in (tmp_path / "out" / "index.html").read_text()
+    assert {"costs.png", "crosstalk.png"} <= {path.name for path in (tmp_path / "out").iterdir()}
