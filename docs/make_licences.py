@@ -26,7 +26,8 @@ and the packages' metadata.
 """
 TAIL = """
 Wheels of binary packages bundle further libraries, each under the licence in that wheel's texts: among them
-OpenBLAS and the GCC runtime (numpy, scipy), FFmpeg under LGPL-2.1 (opencv), GLFW under Zlib (glfw).
+OpenBLAS and the GCC runtime (numpy, scipy), FFmpeg under LGPL-2.1 (opencv), FFmpeg with x264 and x265
+under GPL-2.0 or later (av), GLFW under Zlib (glfw).
 
 The networks that find eyes (`runtime/eyes/models`) are under Apache-2.0 (the text in LICENSE): `yunet.onnx` is YuNet as
 its authors publish it (ShiqiYu/libfacedetection.train); `face_mesh.onnx` and `iris.onnx` are MediaPipe's face landmark

@@ -4,26 +4,29 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext, suppress
+from contextlib import closing, nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 
 from runtime.clock import NS_PER_S, MonotonicClock
 from runtime.config import Settings
-from runtime.errors import EndOfRecording, InputError, SensorTimeout
+from runtime.errors import EndOfRecording, SensorTimeout
 from runtime.eyes.detect import EyeFinder
 from runtime.eyes.face_flow import RIGID
 from runtime.eyes.pupils import Pupils
 from runtime.records import U8, SensorFrame
 from runtime.sensor.recording import Recording
 from runtime.sensor.registry import open_sensor
-from runtime.support.artifacts import OutputFolder, held_back, png_bytes
-from runtime.support.film import VIDEOS, open_film
+from runtime.support.artifacts import OutputFolder, png_bytes
 from runtime.support.picture_file import read_image
+from runtime.support.picture_header import VIDEOS
+
+if TYPE_CHECKING:
+    from runtime.support.film import FilmWriter
 
 RECORDING = ".mcap"
 OVERLAY_MIN_PX = 640  # an overlay's longer side has at least this many pixels
@@ -74,7 +77,7 @@ def look_at_files(
         files: Pictures, films or recordings, in the same order as the rows.
         settings: Settings for the eye finder.
         sequence: True to follow the viewer from one still picture to the next.
-        rate_hz: Frame rate of still pictures, and of films that do not give a rate.
+        rate_hz: Frame rate of still pictures.
         out: Folder for overlays, which show the eyes found. If None, no overlays are drawn.
 
     Raises:
@@ -88,7 +91,7 @@ def look_at_files(
                 watcher.forget()
             follows = is_still
             target = None if folder is None else folder.staging / f"{place:03d}-{path.stem}"
-            with _Overlays(target, is_still, rate_hz) as overlays:
+            with _Overlays(target, is_still) as overlays:
                 for number, frame in enumerate(_frames(path, place, rate_hz)):
                     row, pupils = watcher.look(frame, str(path), None if is_still else number)
                     rows.append(row)
@@ -102,7 +105,7 @@ def _frames(path: Path, place: int, rate_hz: float) -> Iterator[SensorFrame]:
     Args:
         path: A picture, film or recording.
         place: A still picture's index in the sequence, used to compute its time.
-        rate_hz: Frame rate of still pictures, and of films that do not give a rate.
+        rate_hz: Frame rate of still pictures.
 
     Raises:
         InputError: The file cannot be read or decoded.
@@ -113,44 +116,33 @@ def _frames(path: Path, place: int, rate_hz: float) -> Iterator[SensorFrame]:
             # Ignore the recorded eyes, and look for them in the pictures again.
             yield frame if frame.colour is None else replace(frame, eyes=None)
     elif kind in VIDEOS:
-        yield from _filmed(path, rate_hz)
+        yield from _filmed(path)
     else:
         yield SensorFrame(place, round(place * NS_PER_S / rate_hz), colour=read_image(path))
 
 
-def _filmed(path: Path, rate_hz: float) -> Iterator[SensorFrame]:
-    """Yield all frames in a film. Raises InputError if it cannot be decoded."""
-    with held_back():  # hides messages from FFmpeg and OpenCV, which become one error
-        capture = open_film(path)
-    try:
-        rate = capture.get(cv2.CAP_PROP_FPS)
-        rate = rate if 0.1 <= rate <= 1000 else rate_hz
-        number = 0
-        while True:
-            done, bgr = capture.read()
-            if not done:
-                break
-            yield SensorFrame(number, round(number * NS_PER_S / rate), colour=np.ascontiguousarray(bgr[..., ::-1]))
-            number += 1
-    finally:
-        capture.release()
-    if not number:
-        raise InputError(path, "", "cannot be decoded as a film")
+def _filmed(path: Path) -> Iterator[SensorFrame]:
+    """Yield all frames in a film, with their times in it. Raises InputError if it cannot be decoded."""
+    from runtime.support.film import Film  # PyAV is in an extra
+
+    with closing(Film(path)) as film:
+        for number, (time_ns, frames) in enumerate(film.pictures()):
+            yield SensorFrame(number, time_ns, colour=film.rgb(frames[:1]))
 
 
 class _Overlays:
     """Writes overlays to a picture or film that only the owner can read. Without a path, does nothing."""
 
-    def __init__(self, target: Path | None, is_still: bool, rate_hz: float) -> None:
-        self._target, self._is_still, self._rate_hz = target, is_still, rate_hz
-        self._film: Any = None
+    def __init__(self, target: Path | None, is_still: bool) -> None:
+        self._target, self._is_still = target, is_still
+        self._film: FilmWriter | None = None
 
     def __enter__(self) -> _Overlays:
         return self
 
     def __exit__(self, *_: object) -> None:
         if self._film is not None:
-            self._film.release()
+            self._film.close()
 
     def add(self, frame: SensorFrame, pupils: Pupils | None, row: Row) -> None:
         if self._target is None or frame.colour is None:
@@ -161,11 +153,11 @@ class _Overlays:
         if self._is_still:
             path.write_bytes(png_bytes(picture))
             return
-        height, width = picture.shape[0] // 2 * 2, picture.shape[1] // 2 * 2
         if self._film is None:
-            code = cv2.VideoWriter.fourcc(*"mp4v")
-            self._film = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, code, self._rate_hz, (width, height))
-        self._film.write(np.ascontiguousarray(picture[:height, :width, ::-1]))
+            from runtime.support.film import FilmWriter
+
+            self._film = FilmWriter(path)
+        self._film.write(picture, time_ns=frame.capture_ns)
 
 
 def drawn(picture: U8, pupils: Pupils | None, row: Row) -> U8:
@@ -213,7 +205,7 @@ def look_at_sensor(
     end = time.monotonic() + seconds
     with OutputFolder(out) if out is not None else nullcontext() as folder, driver:
         target = None if folder is None else folder.staging / settings.sensor.driver
-        overlays = _Overlays(target, True, settings.loop.rate_hz)
+        overlays = _Overlays(target, True)
         with suppress(KeyboardInterrupt, EndOfRecording):
             while time.monotonic() < end:
                 with suppress(SensorTimeout):

@@ -5,25 +5,28 @@ from __future__ import annotations
 import logging
 from abc import ABC, abstractmethod
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import accumulate
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from runtime.clock import NS_PER_MS, NS_PER_S
 from runtime.config import ContentSettings
-from runtime.content.film_header import film_header
 from runtime.content.layout import MONO, PAIR, Layout, hint, layout_of, of_film
 from runtime.content.placing import DARK
 from runtime.errors import ContentFailure, InputError
 from runtime.records import U8
 from runtime.support import progress
-from runtime.support.film import VIDEOS, open_film
 from runtime.support.picture_file import read_animation, read_views
-from runtime.support.picture_header import RAW, Header, camera_set_in, check_size, header_of_file
+from runtime.support.picture_header import RAW, VIDEOS, Header, camera_set_in, check_size, header_of_file
+
+if TYPE_CHECKING:
+    from runtime.support.film import Film, Picture
 
 log = logging.getLogger("phasestack.content")
 
@@ -34,13 +37,7 @@ PICTURES = (
 NOT_READ = (*RAW, ".jxl", ".exr", ".hdr", ".psd", ".svg", ".jp2", *VIDEOS)  # skipped and logged if found in a folder
 TOLD = 3  # number of skipped files per folder that are named in the log
 TELL_EVERY = 64  # number of pictures between progress reports
-VIDEO_FRAMES_MAX = 1e8  # most frames that a header may declare: five weeks at 30 frames per second
-VIDEO_PROPERTIES = (
-    cv2.CAP_PROP_FRAME_COUNT,
-    cv2.CAP_PROP_FPS,
-    cv2.CAP_PROP_FRAME_WIDTH,
-    cv2.CAP_PROP_FRAME_HEIGHT,
-)
+SKIPPED = 60  # most frames that are decoded in passing instead of seeking
 
 
 class Frames(ABC):
@@ -152,50 +149,61 @@ class Animation(Frames):
 
 
 class Video(Frames):
-    """The frames of a video file, decoded by OpenCV during playback."""
+    """The frames of a film, decoded during playback and each shown at its own time."""
 
-    def __init__(self, path: Path, layout: Layout) -> None:
-        self._path, self.layouts = path, [layout]
-        self._capture = open_film(path)
-        if not self._capture.isOpened():
-            raise InputError(path, "", "cannot be decoded as a film")
+    def __init__(self, path: Path, settings: ContentSettings, times_ns: NDArray[np.int64] | None = None) -> None:
+        """Open a film and decode its first frame.
+
+        Args:
+            path: Film file.
+            settings: Content settings.
+            times_ns: The frames' times, if they are known; see `Film`.
+
+        Raises:
+            InputError: The film cannot be decoded.
+        """
+        from runtime.support.film import Film  # PyAV is in an extra
+
+        self._film, self._settings = Film(path, times_ns=times_ns), settings
+        self._background = settings.background or DARK
+        self.count = len(self._film.times_ns) - 1
+        self._pictures: Iterator[Picture] = iter(())
+        self._index, self._shown_ns, self._last = self.count, -1, np.empty((0, 0, 3), np.uint8)
         try:
-            count, self.rate_hz, width, height = (float(self._capture.get(key)) for key in VIDEO_PROPERTIES)
-            if not (1 <= count <= VIDEO_FRAMES_MAX and 0.1 < self.rate_hz < 1000):
-                raise InputError(path, "frames", f"a film of {count:g} frames at {self.rate_hz:g} Hz cannot be played")
-            check_size(round(width), round(height), source=path)
+            picture = self.frame(0)
+            self.layouts = [_film_layout(self._film, settings, picture)]
+        except ContentFailure as failure:
+            self.close()
+            raise InputError(path, "frames", "the first frame cannot be decoded") from failure
         except BaseException:
-            self._capture.release()
+            self.close()
             raise
-        self.count = int(count)
-        self._next = 0
-        self._last: U8 = np.empty((0, 0, 3), np.uint8)
-        self.frame(0)
+
+    def at(self, time_ns: int) -> int:
+        times_ns = self._film.times_ns[: self.count + 1]
+        return int(np.searchsorted(times_ns, time_ns % int(times_ns[-1]), side="right")) - 1
 
     def frame(self, index: int) -> U8:
-        if index == self._next - 1 and self._last.size:
+        film, wanted_ns = self._film, int(self._film.times_ns[index])
+        if index < self._index or index > self._index + SKIPPED:
+            self._pictures, self._shown_ns = film.pictures(wanted_ns), -1
+        self._index = index
+        if self._shown_ns >= wanted_ns:
             return self._last
-        if index < self._next or index > self._next + 60:
-            self._capture.set(cv2.CAP_PROP_POS_FRAMES, index)
-            self._next = index
-        while self._next < index:
-            self._capture.grab()
-            self._next += 1
-        done, bgr = self._capture.read()
-        if not done:
-            if self._next == 0:
-                raise InputError(self._path, "frames", "the first frame cannot be decoded")
-            self.count = self._next  # containers may declare more frames than they contain
-            raise ContentFailure(f"{self._path}: frame {index} cannot be decoded")
-        self._next = index + 1
-        self._last = np.ascontiguousarray(bgr[..., ::-1], np.uint8)
-        return self._last
+        for time_ns, frames in self._pictures:
+            if time_ns >= wanted_ns:
+                check_size(frames[0].width, frames[0].height, source=film.path)
+                views = frames[:1] if self._settings.layout == "mono" else frames
+                self._last, self._shown_ns = film.rgb(views, background=self._background), time_ns
+                return self._last
+        self.count = max(index, 1)  # the file is cut off
+        raise ContentFailure(f"{film.path}: frame {index} cannot be decoded")
 
     def close(self) -> None:
-        self._capture.release()
+        self._film.close()
 
-    def __reduce__(self) -> tuple[type, tuple[Path, Layout]]:
-        return Video, (self._path, self.layouts[0])
+    def __reduce__(self) -> tuple[type, tuple[Any, ...]]:
+        return Video, (self._film.path, self._settings, self._film.times_ns)
 
 
 def layout_in(header: Header, path: Path, settings: ContentSettings, folder: Path | None = None) -> Layout:
@@ -222,7 +230,7 @@ def open_frames(path: Path, settings: ContentSettings) -> Frames:
     """
     if not path.is_dir():
         if path.suffix.lower() in VIDEOS:
-            return _open_film(path, settings)
+            return Video(path, settings)
         return Animation(path, settings) if header_of_file(path).is_animated else PictureFiles([path], settings)
     paths = sorted(item for item in path.iterdir() if item.suffix.lower() in (*PICTURES, *NOT_READ))
     if not paths:
@@ -238,16 +246,23 @@ def _suggest(path: Path, picture: U8) -> None:
         log.warning("%s: the halves are almost the same; if they are two views, pass --layout %s", path, found)
 
 
-def _open_film(path: Path, settings: ContentSettings) -> Video:
-    stated = film_header(path)
+def _film_layout(film: Film, settings: ContentSettings, picture: U8) -> Layout:
+    """Return the layout of a film whose first picture is given. Logs views that are not shown."""
+    stated, path = film.header, film.path
     if stated.left_out and settings.layout == "auto":
         log.warning("%s: showing the film without %s", path, stated.left_out)
     layout = layout_of(path, settings, stated=stated.layout)
-    video = Video(path, replace(layout, span_deg=stated.span_deg or layout.span_deg))
+    layout = replace(layout, span_deg=stated.span_deg or layout.span_deg, sample_aspect=stated.pixel_aspect)
+    if stated.views == 2 and settings.layout != "mono":
+        return replace(
+            PAIR, span_deg=layout.span_deg, sample_aspect=layout.sample_aspect, right_first=layout.right_first
+        )
     if settings.layout == "auto":
-        height, width = video.frame(0).shape[:2]
-        video.layouts = [of_film(video.layouts[0], path, width_px=width, height_px=height)]
-    return video
+        height, width = picture.shape[:2]
+        layout = of_film(layout, path, width_px=round(width * stated.pixel_aspect), height_px=height)
+        if layout.kind == "mono" and not layout.span_deg and not stated.left_out:
+            _suggest(path, picture)
+    return layout
 
 
 def _why_none(folder: Path) -> str:

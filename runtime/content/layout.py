@@ -56,6 +56,7 @@ class Layout:
     right_first: bool = False  # True if the right eye's view comes first
     span_deg: int = 0  # longitude covered by equirectangular views, or 0 for flat views
     view_aspect: float = 0.0  # width over height of a quilt's views, or 0 if their pixels are square
+    sample_aspect: float = 1.0  # width over height of a film's pixels
 
     def views(self, picture: U8) -> list[U8]:
         """Split a picture into its views, ordered as in `parts`. Equirectangular views are cropped.
@@ -99,8 +100,8 @@ class Layout:
     def pixel_aspect(self, *, width_px: int, height_px: int) -> float:
         """Return the aspect ratio (width over height) of the pixels in a view of the given size."""
         if self.half:
-            return float(self.columns) if self.columns > 1 else 1 / self.rows
-        return self.view_aspect * height_px / width_px if self.view_aspect else 1.0
+            return self.sample_aspect * (self.columns if self.columns > 1 else 1 / self.rows)
+        return self.view_aspect * height_px / width_px if self.view_aspect else self.sample_aspect
 
 
 MONO, PAIR = Layout("mono"), Layout("side-by-side", columns=2)  # PAIR is for files with two pictures in them

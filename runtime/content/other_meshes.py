@@ -171,9 +171,10 @@ def _grey() -> bytes:
 
 
 def _points(cloud: Any, origin: Origin) -> list[tuple[F32, F32]]:
-    places = origin.relative(getattr(cloud, "vertices", np.empty((0, 3)))).astype(np.float32)
-    if not len(places) or places.shape[1:] != (3,) or not hasattr(cloud, "colors"):
+    vertices = np.asarray(getattr(cloud, "vertices", np.empty((0, 3))))
+    if not len(vertices) or vertices.shape[1:] != (3,) or not hasattr(cloud, "colors"):
         return []
+    places = origin.relative(vertices).astype(np.float32)
     colours = np.asarray(cloud.colors)
     return [(places, _unit(colours)[:, :3] if len(colours) == len(places) else np.full_like(places, np.nan))]
 

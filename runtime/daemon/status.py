@@ -25,7 +25,7 @@ from runtime.model.predictor import SHIPPED
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
 from runtime.records import U8, RefreshAccount
-from runtime.support.film import VIDEOS
+from runtime.support.picture_header import VIDEOS
 from runtime.support.version import version
 
 LIBRARY_MOST, LIBRARY_LOOKED_AT = 200, 2000  # limits: how many scenes are listed, how many folder entries are examined

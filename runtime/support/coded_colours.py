@@ -1,17 +1,19 @@
-"""ICC profiles for AVIF and HEIC pictures that declare colours by code (`nclx`, ITU-T H.273)."""
+"""Colours declared by code (ITU-T H.273): ICC profiles for AVIF and HEIC pictures (`nclx`), and sRGB for films."""
 
 from __future__ import annotations
 
 import re
 import struct
 
+import cv2
 import numpy as np
 
-from runtime.records import F64
+from runtime.records import F64, U8
 
 NCLX = re.compile(rb"colrnclx(..)(..)", re.DOTALL)
 SEARCHED = 1 << 18  # number of bytes at the beginning of a file to search for the colour codes
 PQ, HLG = 16, 18  # transfer characteristics codes; all other codes are treated as sRGB
+BRIGHT = (PQ, HLG)
 PAPER_NITS, PQ_NITS = 203.0, 10_000.0  # white's luminance (ITU-R BT.2408), and PQ's maximum luminance
 PRIMARIES = {  # XYZ of red, green and blue, keyed by code and adapted to D50; code 1 (BT.709) has sRGB's primaries
     1: ((0.43607, 0.22249, 0.01392), (0.38515, 0.71687, 0.09708), (0.14307, 0.06061, 0.71410)),
@@ -21,6 +23,7 @@ PRIMARIES = {  # XYZ of red, green and blue, keyed by code and adapted to D50; c
 D50 = (0.9642, 1.0, 0.8249)
 SRGB_CURVE = (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)  # an ICC curve's parameters g, a, b, c, d
 SAMPLES = 4096  # number of samples in a transfer curve
+ROWS = 32  # rows converted together, which fit into a processor's cache
 
 
 def stated_profile(coded: bytes) -> bytes:
@@ -36,7 +39,7 @@ def stated_profile(coded: bytes) -> bytes:
     if found is None:
         return b""
     primaries, transfer = (int.from_bytes(code, "big") for code in found.groups())
-    is_bright = transfer in (PQ, HLG)
+    is_bright = transfer in BRIGHT
     if primaries not in PRIMARIES or (primaries == 1 and not is_bright):
         return b""
     curve = _table(transfer) if is_bright else b"para" + bytes(4) + struct.pack(">HH", 3, 0) + _fixed(*SRGB_CURVE)
@@ -74,3 +77,17 @@ def _hlg(code: F64) -> F64:
     """Decode hybrid log-gamma (HLG, ARIB STD-B67) per channel, with the gamma of a 1000-nit screen."""
     a, b, c = 0.17883277, 0.28466892, 0.55991073
     return np.asarray(np.where(code <= 0.5, code**2 / 3, (np.exp((code - c) / a) + b) / 12) ** 1.2)
+
+
+def srgb_from(rgb: U8, *, primaries: int, transfer: int) -> U8:
+    """Convert a picture (h, w, 3) with PQ or HLG codes to sRGB. Light brighter than paper white is clipped."""
+    code = np.linspace(0.0, 1.0, 256)
+    light = _pq(code) if transfer == PQ else _hlg(code) / _hlg(np.array(0.75))
+    own, srgb = (np.array(PRIMARIES.get(number, PRIMARIES[1])).T for number in (primaries, 1))
+    matrix, steps = np.linalg.inv(srgb) @ own * (SAMPLES - 1), np.linspace(0.0, 1.0, SAMPLES)
+    curve = np.where(steps <= 0.0031308, 12.92 * steps, 1.055 * steps ** (1 / 2.4) - 0.055)
+    table, converted = np.rint(255 * curve).astype(np.uint8), np.empty_like(rgb)
+    for first in range(0, len(rgb), ROWS):
+        linear = cv2.transform(cv2.LUT(rgb[first : first + ROWS], np.clip(light, 0, 1).astype(np.float32)), matrix)
+        np.take(table, np.rint(linear).astype(np.int16), mode="clip", out=converted[first : first + ROWS])
+    return converted

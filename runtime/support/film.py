@@ -1,39 +1,326 @@
-"""Open films with OpenCV's FFmpeg backend, which may access only the named file."""
+"""Decode and write films with PyAV (FFmpeg), which may open only the named file."""
 
 from __future__ import annotations
 
-import os
-import threading
+import re
+import struct
+from collections import deque
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
+from typing import Any, cast
 
-import cv2
+import av
+import numpy as np
+from numpy.typing import NDArray
 
-from runtime.support import untrusted_input
+from runtime.clock import NS_PER_MS, NS_PER_S
+from runtime.errors import InputError, SensorLost
+from runtime.records import U8
+from runtime.support import progress, untrusted_input
+from runtime.support.coded_colours import BRIGHT, srgb_from
 
-VIDEOS = (".mp4", ".mkv", ".avi", ".mov", ".webm", ".m4v")
 CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
-OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
-_alone = threading.Lock()
+COVER = 1024  # FFmpeg's AV_DISPOSITION_ATTACHED_PIC
+FRAMES_MAX = 10_000_000  # most frames in a film: four days at 30 per second
+SCANNED_BYTES = 1 << 30  # in larger files, frames at a constant rate are not looked up one by one
+WITH_ALPHA = {"vp8": "libvpx", "vp9": "libvpx-vp9"}  # decoders of the transparency in WebM, which FFmpeg's own ignore
+STEREO = {1: "side-by-side", 2: "top-bottom"}  # FFmpeg's AVStereo3DType
+UNSEEN = {3: "alternating frames", 4: "checkerboard", 5: "quincunx", 6: "alternating rows", 7: "alternating columns"}
+SECOND_VIEW = 8  # AVStereo3DType of MV-HEVC, whose second view FFmpeg does not decode unless asked
+HALF_EQUIRECTANGULAR = 3  # AVSphericalProjection
+
+# The camera may answer with a playlist (HLS), but not make FFmpeg open local files.
+STREAM_OPTIONS = {
+    "protocol_whitelist": "http,https,httpproxy,tcp,tls,udp,rtp,srtp,rtsp,rtsps,crypto",
+    "rtsp_flags": "prefer_tcp",
+    "fflags": "nobuffer",
+}
+ANSWERS_IN_S = 5.0  # longest wait for a network camera's answer or next picture
+REASONS = {  # why a network camera cannot be opened
+    av.error.HTTPUnauthorizedError: "asks for a password; set sensor.source to rtsp://user:password@host/path",
+    av.error.HTTPForbiddenError: "refuses this user; correct the user name and password in sensor.source",
+    av.error.HTTPNotFoundError: "has no stream of this name (404); correct the path in sensor.source",
+    av.error.ConnectionRefusedError: "refuses connections; switch the camera on, or correct sensor.source",
+    av.error.ExitError: f"does not answer within {ANSWERS_IN_S:g} s",
+    av.error.OSError: "cannot be reached or sends no pictures; correct sensor.source",
+    av.error.InvalidDataError: "does not answer or sends no pictures; correct sensor.source",
+}
+
+Picture = tuple[int, tuple[av.VideoFrame, ...]]  # time in ns from the start; a frame, or the left and right view's
 
 
-def open_film(path: Path) -> cv2.VideoCapture:
-    """Open a film.
+@dataclass(frozen=True, slots=True)
+class FilmHeader:
+    """The arrangement that a film file declares. Fields it does not declare have their defaults."""
+
+    layout: str = ""  # in the syntax of `content.layout`
+    span_deg: int = 0  # longitude covered by equirectangular views
+    left_out: str = ""  # description of a view that is declared but not supported
+    pixel_aspect: float = 1.0  # pixel width divided by pixel height
+    views: int = 1  # 2 if the left and right view are separate streams
+
+
+class Film:
+    """A film file's frames and their times.
+
+    If the file has two streams of equal pictures, such as Fuji's 3D films, they are the left and right view. An audio
+    file's cover is a film of one frame.
+    """
+
+    def __init__(self, path: Path, *, times_ns: NDArray[np.int64] | None = None) -> None:
+        """Open a film.
+
+        Args:
+            path: Film file.
+            times_ns: The frames' times (n + 1,), if they are known.
+
+        Raises:
+            InputError: The path is not a regular file, or the file cannot be decoded.
+        """
+        self.path = path
+        self._container: Any = None
+        self._start_ns = 0
+        first = next(self.pictures(), None)
+        if first is None:
+            self.close()
+            raise InputError(path, "frames", "the first frame cannot be decoded")
+        self._start_ns = first[0]
+        self.header = _header(first[1][0], self._streams)
+        # (n + 1,) times at which each frame begins and the last one ends, in ns from the first frame
+        self.times_ns = self._times() if times_ns is None else times_ns
+
+    def _open(self) -> None:
+        self.close()
+        self._container = open_film(self.path)
+        self._choose()
+
+    def _choose(self) -> None:
+        """Choose the streams to show, and their decoders."""
+        videos = list(self._container.streams.video)
+        streams = [stream for stream in videos if not stream.disposition & COVER] or videos[:1]
+        if not streams:
+            self.close()
+            raise InputError(self.path, "", "cannot be decoded as a film: it has no pictures")
+        views = {(s.codec_context.name, s.codec_context.width, s.codec_context.height) for s in streams}
+        self._streams = streams if len(streams) == 2 and len(views) == 1 else streams[:1]
+        self._decoders: dict[int, Any] = {}
+        for stream in self._streams:
+            decoder, name = stream.codec_context, WITH_ALPHA.get(stream.codec_context.name, "")
+            if stream.metadata.get("alpha_mode") == "1" and name in av.codecs_available:
+                decoder = av.CodecContext.create(name, "r")
+                decoder.extradata = stream.codec_context.extradata
+            decoder.thread_type = "AUTO"
+            self._decoders[stream.index] = decoder
+
+    def _times(self) -> NDArray[np.int64]:
+        stream = self._streams[0]
+        rate, size = float(stream.average_rate or 0), self.path.stat().st_size
+        length_s = (self._container.duration or 0) / av.time_base
+        if size > SCANNED_BYTES and rate and length_s and abs(float(stream.guessed_rate or 0) / rate - 1) < 1e-3:
+            count = min(max(round(length_s * rate), 1), FRAMES_MAX)
+            return np.asarray(np.rint(np.arange(count + 1) * (NS_PER_S / rate)), np.int64)
+        shown, decoded, last = [], [], 0
+        with open_film(self.path) as container, suppress(av.error.FFmpegError):
+            for packet in container.demux(container.streams[stream.index]):
+                if packet.size and not packet.is_discard:
+                    shown.append(packet.pts)
+                    decoded.append(packet.dts)
+                    last = packet.duration or last
+                if len(shown) % 4096 == 1:
+                    untrusted_input.within(len(shown), FRAMES_MAX, source=self.path, field="frames")
+                    progress.tell(f"{self.path.name}: frames", len(shown))
+        stamps = decoded if None in shown and any(stamp is not None for stamp in decoded) else shown
+        ticks = np.unique(np.array([stamp for stamp in stamps if stamp is not None] or [0], np.int64))
+        gap = int(np.median(np.diff(ticks))) if len(ticks) > 1 else 0
+        times_ns = np.append(ticks, ticks[-1] + max(last or gap, 1)) * (NS_PER_S * float(stream.time_base or 1))
+        times_ns = np.rint(times_ns - times_ns[0])
+        if times_ns[-2] < length_s * NS_PER_S < times_ns[-1]:  # a rate that varies makes the last duration a guess
+            times_ns[-1] = length_s * NS_PER_S
+        return np.asarray(times_ns, np.int64)
+
+    def pictures(self, since_ns: int = 0) -> Iterator[Picture]:
+        """Decode the pictures in order of time, from a given time or earlier. Damaged ones are left out.
+
+        Another iterator must not be in use.
+        """
+        if since_ns > 0:
+            stream = self._streams[0]
+            tick = int((since_ns + self._start_ns) / NS_PER_S / float(stream.time_base or 1))
+            try:
+                self._container.seek(tick, stream=stream)
+                for decoder in self._decoders.values():
+                    decoder.flush_buffers()
+            except av.error.FFmpegError:
+                since_ns = 0
+        if since_ns <= 0:
+            self._open()
+        waiting: dict[int, deque[av.VideoFrame]] = {stream.index: deque() for stream in self._streams}
+        for index, frame in self._decoded():
+            waiting[index].append(frame)
+            while all(waiting.values()):
+                frames = tuple(queue.popleft() for queue in waiting.values())
+                yield self._time_ns(frames[0]), frames
+
+    def _time_ns(self, frame: av.VideoFrame) -> int:
+        stamp, base = frame.pts if frame.pts is not None else frame.dts, frame.time_base
+        return 0 if stamp is None else round(stamp * float(base or 1) * NS_PER_S) - self._start_ns
+
+    def _decoded(self) -> Iterator[tuple[int, av.VideoFrame]]:
+        """Yield decoded frames with their stream's number. Interlaced frames are converted to progressive ones."""
+        graphs: dict[int, Any] = {}
+        packets = self._container.demux(self._streams)
+        while True:
+            try:
+                packet = next(packets, None)
+                if packet is None:
+                    return
+                index = packet.stream.index
+                frames = self._decoders[index].decode(packet)
+            except av.error.EOFError:
+                return
+            except av.error.InvalidDataError:  # the next packet may be intact
+                continue
+            except av.error.FFmpegError:
+                return
+            for frame in frames:
+                if index not in graphs and frame.interlaced_frame:
+                    graphs[index] = _progressive(frame)
+                yield from ((index, one) for one in _filtered(graphs.get(index), frame))
+            if not packet.size:  # the stream's end
+                yield from ((index, one) for one in _filtered(graphs.pop(index, None), None))
+
+    def rgb(self, frames: tuple[av.VideoFrame, ...], *, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> U8:
+        """Convert frames to a picture (h, w, 3), upright and over a background. Two views are joined side by side."""
+        views = [_rgb(frame, background) for frame in frames]
+        return views[0] if len(views) == 1 else np.concatenate(views, axis=1)
+
+    def close(self) -> None:
+        if self._container is not None:
+            self._container.close()
+
+
+class NetworkStream(Film):
+    """A network camera's pictures, which cannot be repeated."""
+
+    def __init__(self, url: str) -> None:
+        self._url, self._container, self._start_ns = url, None, 0
+
+    def _open(self) -> None:
+        """Connect. Raises SensorLost with the reason if the camera sends no pictures. Messages contain no password."""
+        shown = without_password(self._url)
+        try:
+            self._container = av.open(self._url, options=STREAM_OPTIONS, timeout=ANSWERS_IN_S)
+        except (av.error.FFmpegError, UnicodeError) as error:
+            told = getattr(error, "strerror", "") or "not a URL"  # the error itself contains the password
+            why = next((why for kind, why in REASONS.items() if isinstance(error, kind)), f"cannot be read: {told}")
+            raise SensorLost(f"{shown} {why}") from None
+        if not self._container.streams.video:
+            raise SensorLost(f"{shown} sends no pictures; correct sensor.source")
+        self._choose()
+
+
+def without_password(url: str) -> str:
+    """Return a URL without its user name and password."""
+    return re.sub(r"(?<=://)[^/@]*@", "", url)
+
+
+class FilmWriter:
+    """Writes pictures of one size to an MP4 file, each with its own time."""
+
+    def __init__(self, path: Path) -> None:
+        self._container = av.open(str(path), "w")
+        self._stream: Any = None
+        self._begin_ns = 0
+        self._last_ms = -1
+
+    def write(self, picture: U8, *, time_ns: int) -> None:
+        """Add a picture (h, w, 3). An odd last row or column is left out. Times are on any clock, and ascend."""
+        height, width = picture.shape[0] // 2 * 2, picture.shape[1] // 2 * 2
+        if self._stream is None:
+            self._stream, self._begin_ns = self._container.add_stream("mpeg4", rate=1000), time_ns
+            self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, "yuv420p"
+            self._stream.codec_context.time_base = Fraction(1, 1000)
+            self._stream.bit_rate = 8 * width * height  # as much as keeps thin marks sharp
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture[:height, :width]), format="rgb24")
+        self._last_ms = max(round((time_ns - self._begin_ns) / NS_PER_MS), self._last_ms + 1)
+        frame.pts, frame.time_base = self._last_ms, Fraction(1, 1000)
+        self._container.mux(self._stream.encode(frame))
+
+    def close(self) -> None:
+        if self._stream is not None:
+            self._container.mux(self._stream.encode(None))
+        self._container.close()
+
+
+def open_film(path: Path) -> av.container.InputContainer:
+    """Open a film's container.
 
     FFmpeg is restricted to local files and video containers. Otherwise, a playlist or script with a film's suffix, or a
-    name that looks like a URL, could make FFmpeg open other files and network connections. Messages from FFmpeg and
-    OpenCV are suppressed because, unlike the project's own errors, they do not name the file.
+    name that looks like a URL, could make FFmpeg open other files and network connections.
 
-    Raises InputError if the path is not a regular file or the file cannot be read.
+    Raises InputError if the path is not a regular file or is not a film.
     """
     untrusted_input.open_regular(path).close()
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    with _alone:
-        before, level = os.environ.get(OPTIONS), cv2.utils.logging.setLogLevel(0)
-        os.environ[OPTIONS] = f"protocol_whitelist;file|format_whitelist;{CONTAINERS}"
-        try:
-            return cv2.VideoCapture(str(path.absolute()), cv2.CAP_FFMPEG)
-        finally:
-            cv2.utils.logging.setLogLevel(level)
-            os.environ.pop(OPTIONS)
-            if before is not None:
-                os.environ[OPTIONS] = before
+    options = {"protocol_whitelist": "file", "format_whitelist": CONTAINERS}
+    try:
+        return av.open(f"file:{path.absolute()}", options=options)
+    except (av.error.FFmpegError, UnicodeError):
+        raise InputError(path, "", "cannot be decoded as a film") from None
+
+
+def _header(frame: av.VideoFrame, streams: list[Any]) -> FilmHeader:
+    """Return what a film declares, as FFmpeg reports it with the first frame."""
+    stream, items = streams[0], cast(Any, frame.side_data)
+    side = {item.type.name: bytes(item) for item in items}
+    kind, flags = struct.unpack_from("<ii", side.get("STEREO3D", bytes(8)))
+    layout = "cross-eyed" if STEREO.get(kind) == "side-by-side" and flags & 1 else STEREO.get(kind, "")
+    if stream.metadata.get("stereo_mode", "").startswith("anaglyph_cyan"):
+        layout = "anaglyph"
+    left_out = "its second view (MV-HEVC); convert it to side by side" if kind == SECOND_VIEW else ""
+    if kind in UNSEEN:
+        left_out = f"its second view ({UNSEEN[kind]}); convert it to side by side"
+    span_deg = 0
+    if "SPHERICAL" in side:
+        projection, *_ = struct.unpack_from("<i", side["SPHERICAL"])
+        left, _, right = struct.unpack_from("<III", side["SPHERICAL"], 16)
+        is_half = projection == HALF_EQUIRECTANGULAR or left + right > (1 << 30)
+        span_deg = 180 if is_half else 360
+    aspect = float(stream.sample_aspect_ratio or 1) or 1.0
+    aspect = aspect if frame.rotation % 180 == 0 else 1 / aspect
+    return FilmHeader(layout, span_deg, left_out, aspect, len(streams))
+
+
+def _progressive(frame: av.VideoFrame) -> Any:
+    """Return a filter that interpolates the lines of interlaced frames like the given one."""
+    graph = av.filter.Graph()
+    source = graph.add_buffer(width=frame.width, height=frame.height, format=frame.format, time_base=frame.time_base)
+    graph.link_nodes(source, graph.add("bwdif", "mode=send_frame:deint=interlaced"), graph.add("buffersink"))
+    graph.configure()
+    return graph
+
+
+def _filtered(graph: Any, frame: av.VideoFrame | None) -> Iterator[av.VideoFrame]:
+    """Pass a frame through a filter, if there is one. None marks the stream's end, and returns what is left."""
+    if graph is None:
+        yield from () if frame is None else (frame,)
+        return
+    graph.vpush(frame)
+    with suppress(av.error.BlockingIOError, av.error.EOFError):
+        while True:
+            yield graph.vpull()
+
+
+def _rgb(frame: av.VideoFrame, background: tuple[float, float, float]) -> U8:
+    if any(component.is_alpha for component in frame.format.components):
+        rgba = frame.to_ndarray(format="rgba")
+        alpha = rgba[..., 3:].astype(np.uint16)
+        under = np.array([round(255 * value) for value in background], np.uint16) * (255 - alpha)
+        picture = ((rgba[..., :3] * alpha + under + 127) // 255).astype(np.uint8)
+    else:
+        picture = np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
+    if frame.color_trc in BRIGHT:
+        picture = srgb_from(picture, primaries=frame.color_primaries, transfer=frame.color_trc)
+    return np.ascontiguousarray(np.rot90(picture, round(frame.rotation / 90) % 4))

@@ -38,6 +38,7 @@ HEAD_BYTES = 512  # number of bytes at the beginning of a file used to identify 
 UNDECODED = "cannot be decoded as an image"
 ANOTHER = "save it as PNG, JPEG or AVIF"
 CAMERA_SET = "train the scene first and open its splats (.ply), or open its folder of pictures as a slideshow"
+VIDEOS = (".mp4", ".mkv", ".avi", ".mov", ".webm", ".m4v")  # suffixes of films
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")  # mostly TIFF files
 RAW_KIND = "a camera's raw picture", "develop it and save it as JPEG"
 OTHER_KINDS = (  # unsupported formats, each with the offset and value of its marker, its name and a remedy

@@ -112,8 +112,11 @@ def of_colours(coded: bytes, *, primaries: int, transfer: int) -> bytes:
     return coded[:at] + struct.pack(">HH", primaries, transfer) + coded[at + 4 :]
 
 
-def film(path: Path, frame: U8, *, added: bytes = b"", mode: int = 0) -> Path:
-    """Three equal frames; with boxes added to an MP4's description of its pictures, or a Matroska's StereoMode."""
+SAMPLES = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd", b"mp4v")  # boxes around a film's description
+
+
+def film(path: Path, frame: U8, *, added: bytes = b"", mode: int = 0, into: tuple[bytes, ...] = SAMPLES) -> Path:
+    """Three equal frames; with boxes added to one of an MP4's boxes, or a Matroska's StereoMode."""
     height, width = frame.shape[:2]
     writer = cv2.VideoWriter(
         str(path), cv2.VideoWriter.fourcc(*("MJPG" if path.suffix == ".mkv" else "mp4v")), 10, (width, height)
@@ -126,7 +129,7 @@ def film(path: Path, frame: U8, *, added: bytes = b"", mode: int = 0) -> Path:
         at = data.index(b"\x54\xb2\x81")  # DisplayUnit has the same length
         data[at : at + 4] = bytes((0x53, 0xB8, 0x81, mode))
     end = 0
-    for kind in (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd", b"mp4v") if added else ():
+    for kind in into if added else ():
         at = data.index(kind, end and data.index(b"moov")) - 4
         size = int.from_bytes(data[at : at + 4], "big")
         data[at : at + 4] = (size + len(added)).to_bytes(4, "big")
@@ -143,7 +146,22 @@ def st3d(mode: int) -> bytes:
 def equirectangular(*, cut: float = 0.0) -> bytes:
     """cut: of the width, left and right each."""
     bounds = struct.pack(">LLL", 0, 0, 0) + struct.pack(">LL", *[int(cut * (1 << 32))] * 2)
-    return _box(b"sv3d", _box(b"proj", _box(b"equi", bounds)))
+    proj = _box(b"proj", _box(b"prhd", bytes(16)) + _box(b"equi", bounds))
+    return _box(b"sv3d", _box(b"svhd", bytes(4) + b"me\0") + proj)
+
+
+def spherical_xml(layout: str) -> bytes:
+    """The form before `sv3d`: XML in a track's `uuid` box (Spherical Video V1 RFC)."""
+    fields = {
+        "Spherical": "true",
+        "Stitched": "true",
+        "StitchingSoftware": "me",
+        "ProjectionType": "equirectangular",
+        "StereoMode": layout,
+    }
+    text = "".join(f"<GSpherical:{name}>{value}</GSpherical:{name}>" for name, value in fields.items())
+    xml = f'<?xml version="1.0"?><rdf:SphericalVideo xmlns:GSpherical="x">{text}</rdf:SphericalVideo>'
+    return _box(b"uuid", bytes.fromhex("ffcc8263f8554a938814587a02521fdd") + xml.encode())
 
 
 def multiview() -> bytes:

@@ -11,7 +11,10 @@ import pytest
 
 from runtime.config import ContentSettings
 from runtime.content.base import ContentSource
+from runtime.content.frames import Video
 from runtime.content.images import WarpedPicture, image_from_view, rgba_from_rgb
+from runtime.content.pictures import PicturesSource
+from runtime.content.placing import SceneFile
 from runtime.content.registry import open_content
 from runtime.errors import ContentFailure, InputError
 from runtime.optics.stack import PanelStack
@@ -110,8 +113,8 @@ def test_a_video_that_ends_repeats(tmp_path: Path, context: Any, stack: PanelSta
 
 def test_a_truncated_video_is_a_failure_that_passes(tmp_path: Path, context: Any, stack: PanelStack) -> None:
     path = make_video(tmp_path / "a.avi", [RED] * 40)
-    source = opened(path, context, stack)
-    source._frames.count = 400  # type: ignore[attr-defined]  # as a damaged container would say
+    declared = Video(path, ContentSettings(), np.arange(401) * 10**8)  # as a damaged container would say
+    source = PicturesSource(declared, file=SceneFile(path, ContentSettings(), stack))
     with pytest.raises(ContentFailure, match=r"a.avi: frame 300"):
         source.render(panel_view(EYES[0], stack.panel(1)), time_ns=30 * 10**9)
     assert np.abs(np.array(centre(source, stack, 0, time_ns=0)) - RED).max() < 12

@@ -11,10 +11,10 @@ import pytest
 from PIL import Image
 
 from runtime.config import ContentSettings
-from runtime.content.film_header import film_header
 from runtime.content.frames import open_frames, read_pair
+from runtime.support.film import Film
 from runtime.support.picture_file import read_image, read_views
-from tests.content.picture_files import equirectangular, film, lif, multiview, of_colours, st3d
+from tests.content.picture_files import equirectangular, film, lif, multiview, of_colours, spherical_xml, st3d
 from tests.content.test_pictures import solid
 
 RED, BLUE = (200, 40, 40), (40, 40, 200)
@@ -76,7 +76,10 @@ def test_a_matroska_film_is_laid_out_as_its_tag_says(tmp_path: Path, mode: int, 
 
 def test_stated_stereo_that_is_not_shown_is_logged(tmp_path: Path, caplog: Any) -> None:
     assert len(views_of(film(tmp_path / "a.mkv", pair(), mode=13))) == 1
-    assert "a.mkv: showing the film without its second view (stereo mode 13); convert it to side by side" in caplog.text
+    assert (
+        "a.mkv: showing the film without its second view (alternating frames); convert it to side by side"
+        in caplog.text
+    )
     film(tmp_path / "a.mp4", pair(), added=multiview())
     assert len(views_of(tmp_path / "a.mp4")) == 1
     assert "a.mp4: showing the film without its second view (MV-HEVC)" in caplog.text
@@ -85,11 +88,8 @@ def test_stated_stereo_that_is_not_shown_is_logged(tmp_path: Path, caplog: Any) 
 def test_a_sphere_of_360_or_180_degrees_is_recognised(tmp_path: Path) -> None:
     for cut, span_deg in ((0.0, 360), (0.25, 180)):
         path = film(tmp_path / "a.mp4", pair(), added=equirectangular(cut=cut))
-        assert film_header(path).span_deg == span_deg
-    text = b"<rdf:RDF><GSpherical:Spherical>true</><GSpherical:StereoMode>top-bottom</></rdf:RDF>"
-    found = film_header(
-        film(tmp_path / "a.mp4", pair(), added=len(text + bytes(8)).to_bytes(4, "big") + b"uuid" + text)
-    )
+        assert Film(path).header.span_deg == span_deg
+    found = Film(film(tmp_path / "a.mp4", pair(), added=spherical_xml("top-bottom"), into=(b"moov", b"trak"))).header
     assert (found.layout, found.span_deg) == ("top-bottom", 360)
 
 

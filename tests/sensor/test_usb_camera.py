@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import io
+import socket
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Thread
 
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from runtime.clock import MonotonicClock
 from runtime.config import SensorSettings, Settings
@@ -58,3 +64,66 @@ def test_what_is_no_camera_is_told() -> None:
     for source in ("97", "/dev/video97", "/dev/null"):
         with pytest.raises(SensorLost, match="/dev/"):
             open_sensor(settings(source), MonotonicClock()).open()
+
+
+class Answers(BaseHTTPRequestHandler):
+    """A network camera: an MJPEG stream at /stream, errors elsewhere."""
+
+    def do_GET(self) -> None:
+        code = {"/private": 401, "/banned": 403, "/gone": 404}.get(self.path, 200)
+        self.send_response(code)
+        self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=next")
+        self.end_headers()
+        if self.path == "/stream":
+            coded = io.BytesIO()
+            Image.new("RGB", (64, 48), (200, 30, 30)).save(coded, "JPEG")
+            for _ in range(20):
+                self.wfile.write(b"--next\r\nContent-Type: image/jpeg\r\n\r\n" + coded.getvalue() + b"\r\n")
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@pytest.fixture
+def server() -> Iterator[int]:
+    with ThreadingHTTPServer(("127.0.0.1", 0), Answers) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        yield server.server_port
+        server.shutdown()
+
+
+def test_a_network_cameras_pictures_are_read(server: int) -> None:
+    with open_sensor(settings(f"http://127.0.0.1:{server}/stream"), MonotonicClock()) as driver:
+        frame = driver.read_newest(1.0)
+        assert frame.colour is not None and frame.colour.shape == (48, 64, 3)
+        assert np.abs(frame.colour.reshape(-1, 3).mean(0) - (200, 30, 30)).max() < 6
+
+
+@pytest.mark.parametrize(
+    ("path", "told"),
+    [
+        ("private", "asks for a password"),
+        ("banned", "refuses this user"),
+        ("gone", "has no stream of this name"),
+        ("text", "sends no pictures"),
+    ],
+)
+def test_a_network_cameras_refusal_is_told_without_its_password(
+    server: int, capfd: pytest.CaptureFixture[str], path: str, told: str
+) -> None:
+    with pytest.raises(SensorLost, match=told) as lost:
+        open_sensor(settings(f"http://me:secret@127.0.0.1:{server}/{path}"), MonotonicClock()).open()
+    assert "secret" not in str(lost.value) and "other programs" not in str(lost.value)
+    assert capfd.readouterr().err == ""  # nothing from FFmpeg
+
+
+def test_a_camera_that_is_off_or_silent_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("runtime.support.film.ANSWERS_IN_S", 0.2)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        port = silent.getsockname()[1]
+        with pytest.raises(SensorLost, match="does not answer"):
+            open_sensor(settings(f"http://127.0.0.1:{port}/"), MonotonicClock()).open()
+        with pytest.raises(SensorLost, match="does not answer"):
+            open_sensor(settings(f"rtsp://127.0.0.1:{port}/"), MonotonicClock()).open()
+    with pytest.raises(SensorLost, match="refuses connections"):
+        open_sensor(settings(f"http://127.0.0.1:{port}/"), MonotonicClock()).open()
