@@ -162,7 +162,7 @@ class Video(Frames):
         Raises:
             InputError: The film cannot be decoded.
         """
-        from runtime.support.film import Film  # PyAV is in an extra
+        from runtime.support.film import Film  # noqa: PLC0415 - PyAV is in an extra
 
         self._film, self._settings = Film(path, times_ns=times_ns), settings
         self._background = settings.background or DARK
