@@ -115,7 +115,7 @@ def _view_error_now_mm(account: RefreshAccount) -> float | None:
 
 
 def about(run: Run) -> dict[str, Any]:
-    """Return a run's constant facts and the available models and scenes, for use by the page."""
+    """Return a run's constant facts and the models and scenes that can be chosen, for use by the page."""
     settings, stack = run.presenter.run_cell.state.settings, run.presenter.stack
     return {
         "version": version(),
@@ -124,7 +124,9 @@ def about(run: Run) -> dict[str, Any]:
         "viewing_side_deg": settings.calibration.viewing_side_deg,
         "viewing_up_deg": settings.calibration.viewing_up_deg,
         "models": (*SHIPPED, "sart"),
-        "scenes": (*SCENES, *preset_names(), *library_scenes(settings.content)),
+        "scenes": (*SCENES, *library_scenes(settings.content)),
+        "library": settings.content.library,
+        "presets": preset_names(),  # scenes whose data is not shipped
     }
 
 

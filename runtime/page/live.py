@@ -156,7 +156,8 @@ class _Page:
                 value = _number(message.get(name), None)
                 if value is None or (name == "camera" and not self._link.is_viewer(me)):
                     continue
-                value = min(max(value, least), most)
+                if not least <= value <= most:
+                    continue
                 if name in ("gap_mm", "camera"):
                     self._link.wishes[name] = value
                 else:

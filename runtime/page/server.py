@@ -36,7 +36,7 @@ SCRIPT, STYLE = "text/javascript", "text/css"
 PROTOCOL = "phasestack"  # WebSocket subprotocol
 METRICS = "text/plain; version=0.0.4; charset=utf-8"  # media type of the Prometheus text format
 ASSETS = {"page.css": STYLE, "look.css": STYLE}
-ASSETS |= dict.fromkeys(("session.js", "page.js", "display.js", "look.js", "try.js"), SCRIPT)
+ASSETS |= dict.fromkeys(("session.js", "page.js", "display.js", "look.js", "try.js", "choice.js"), SCRIPT)
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
     "connect-src 'self'; form-action 'none'; base-uri 'none'; frame-ancestors 'none'",

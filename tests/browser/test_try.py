@@ -20,6 +20,7 @@ from websockets.sync.client import connect
 from runtime.browser.link import BrowserLink
 from runtime.clock import MonotonicClock
 from runtime.config import StackGeometry
+from runtime.content.scenes import SCENES
 from runtime.sensor.browser import BrowserEyes
 from tests.browser.test_viewer import driven, needs_chromium
 from tests.page.rig import ROOT
@@ -31,10 +32,12 @@ TRIED = (
     "the token is not in the address", "the pointer moved the head", "status has the eyes there to 1 mm",
     "another solution", "and the page shows it", "the picture is one", "figures are told", "light has a figure",
     "a moved head has no old figure", "and then its own", "the status and the page agree",
-    "what was asked for is shown", "for this head", "another head has another target", "and the newest again",
-    "the solver is held", "an old status does not undo it", "while alignment goes on", "eyes lost: flat", "and back",
-    "a scene that is not there", "another scene", "another page looks on", "and takes over",
-    "nobody: held, then flat", "back: tracking", "another gap", "its camera is the sensor", "and the pointer again",
+    "a near head aside sees no sliver", "both eyes are described", "what was asked for is shown", "for this head",
+    "another head has another target", "and the newest again", "the solver is held", "an old status does not undo it",
+    "while alignment goes on", "eyes lost: flat", "and back", "a scene that is not there", "another scene",
+    "a new scene has no old figure", "the target is the new scene's", "another page looks on", "and takes over",
+    "nobody: held, then flat", "back: tracking", "a gap out of range is refused", "it restarts, and the page says so",
+    "while the rest of the page stays", "another gap", "its camera is the sensor", "and the pointer again",
     "and the scene stays",
 )  # fmt: skip
 
@@ -199,4 +202,7 @@ def test_it_works_in_a_browser(tmp_path: Path) -> None:
     with trying(tmp_path) as address:
         told = driven("try.mjs", address, os.environ.get("PHASESTACK_SCREENSHOTS") or tmp_path)
     assert [what for what in TRIED if told.get(what) is not True] == []
+    assert [*SCENES] == told["the list has what works"][: len(SCENES)] and "lego_bulldozer" not in told[
+        "the list has what works"
+    ]
     assert told["elsewhere"] == [] and told["errors"] == []

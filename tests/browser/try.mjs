@@ -47,6 +47,23 @@ await page.mouse.move(260, 200);
 say("a moved head has no old figure", await until(async () => !/\d dB/.test(await light()), 5000));
 say("and then its own", await until(async () => /\d dB/.test(await light())));
 say("the status and the page agree", await until(async () => (await light()).includes(`${(await status()).light_db?.toFixed(1)} dB`)));
+const spread = () => page.evaluate(() => { // widths of the display's left and right halves, as seen by the head
+  const eye = window.phasestack.eyes().reduce((a, b) => a.map((v, k) => (v + b[k]) / 2)), at = (y) => Math.atan2(y - eye[1], eye[0]);
+  const gaze = at(0), on = (y) => Math.tan(at(y) - gaze);
+  return [-on(-0.26), on(0.26)];
+});
+await page.mouse.move(40, 200);
+for (let k = 0; k < 10; k += 1) await page.mouse.wheel(0, -200);
+await arrived(page);
+const [one, two] = await spread();
+say("a near head aside sees no sliver", Math.max(one, two) < 3 * Math.min(one, two));
+say("both eyes are described", await page.evaluate(() => ["left", "right"].every((side) => {
+  document.querySelector(`[data-mode=${side}]`).click();
+  return document.querySelector(".hint").textContent.includes(`the ${side} eye sees`);
+})));
+await page.click("[data-mode=parallel]");
+await page.click(".switches button");
+await page.mouse.move(260, 200);
 await page.click("[data-mode=target]");
 say("what was asked for is shown", await until(() => page.evaluate(() => / dB against/.test(document.querySelector(".light").textContent))));
 await page.screenshot({ path: `${folder}/target.png` });
@@ -90,12 +107,19 @@ say("eyes lost: flat", await until(async () => (await status()).state === "flat"
 await page.screenshot({ path: `${folder}/lost.png` });
 await page.uncheck("[name=lost]");
 say("and back", await until(async () => (await status()).state === "tracking"));
-await page.fill("[name=scene]", "no-such-scene");
+say("the list has what works", await page.$$eval("[name=scene] option", (options) => options.map((o) => o.value)));
+await page.selectOption("[name=scene]", "\u2026");
+await page.fill("[name=scene_file]", "no-such-scene");
 await page.keyboard.press("Enter");
 say("a scene that is not there", await until(async () => (await page.textContent(".told")).includes("no-such-scene")));
-await page.fill("[name=scene]", "texture");
-await page.keyboard.press("Enter");
+await until(async () => /\d dB/.test(await light()));
+await page.selectOption("[name=scene]", "texture");
 say("another scene", await until(async () => (await status()).scene === "texture"));
+say("a new scene has no old figure", (await status()).light_db === null || (await status()).light_age_s < 2);
+await page.click("[data-mode=target]");
+say("the target is the new scene's", await until(async () => (await page.textContent(".head")) === "Measured for this position of the head."));
+await page.screenshot({ path: `${folder}/target-texture.png` });
+await page.click("[data-mode=left]");
 
 const other = await newPage();
 await other.goto(origin);
@@ -114,8 +138,20 @@ page = await newPage();
 await page.goto(origin);
 await page.evaluate(() => window.phasestack.ready);
 say("back: tracking", await until(async () => (await status()).state === "tracking"));
-await page.fill("[name=gap_mm]", "40");
-await page.keyboard.press("Enter");
+const gap = async (text) => { await page.fill("[name=gap_mm]", text); await page.keyboard.press("Enter"); };
+const refused = [];
+for (const wrong of ["0", "-5", "10000"]) {
+  await gap(wrong);
+  refused.push(await page.inputValue("[name=gap_mm]") === "60" && (await page.textContent(".told")).includes("must be a number from 1 to 500"));
+}
+say("a gap out of range is refused", refused.every(Boolean));
+await until(async () => (await page.textContent(".figures")).includes("refreshes per second"));
+await gap("40");
+say("it restarts, and the page says so", await until(async () => (await page.textContent(".notice")).includes("Restarting with a gap of 40 mm"), 5000));
+let kept = true;
+const emptied = async () => (kept &&= (await page.inputValue("[name=scene]")) === "texture" && (await page.textContent(".figures")).length > 20);
+await until(async () => { await emptied(); return (await about()).stack?.x_m[2] === 0.04; }, 120000);
+say("while the rest of the page stays", kept);
 say("another gap", await until(async () => (await about()).stack?.x_m[2] === 0.04, 120000));
 await page.check("[name=camera]");
 say("its camera is the sensor", await until(() => page.evaluate(() => /no viewer/.test(document.querySelector(".found figcaption").textContent)), 120000)

@@ -64,6 +64,17 @@ say("state is shown", await until(async () => ["tracking", "holding", "flat", "d
 say("pictures are shown", await until(() => page.evaluate(() =>
   [...document.querySelectorAll("#pictures img[src]")].filter((i) => i.naturalWidth > 100).length >= 3)));
 
+const choose = async (id, value) => {
+  const listed = await page.$$eval(`#${id} option`, (options, value) => options.some((o) => o.value === value), value);
+  await page.selectOption(`#${id}`, listed ? value : "\u2026");
+  if (!listed) await page.fill(`#${id}-file`, value);
+  await page.click(`#${id}-form button`);
+};
+await page.waitForSelector("#scene option[value=grey]", { state: "attached" });
+say("every scene in the list works", await page.$$eval("#scene option", (options) => options.map((o) => o.value)));
+say("and those that need data are named", (await page.textContent(".presets")).includes("lego_bulldozer"));
+say("models to choose from", await page.$$eval("#model option", (options) => options.map((o) => o.value)));
+
 // Live figures change.
 const seen = new Set(), frames = new Set(), curves = new Set(), eyes = new Set();
 for (let k = 0; k < 40; k += 1) {
@@ -88,15 +99,11 @@ await page.keyboard.press("Space");
 say("resume by the keyboard", (await told("resume: done")) && (await statusIs((s) => !s.flat_asked)));
 await page.click("[data-command=reload]");
 say("reload", await told("reload: done"));
-await page.fill("#scene", "grey");
-await page.keyboard.press("Enter");
+await choose("scene", "grey");
 say("scene", (await told("scene: done")) && (await statusIs((s) => s.scene === "grey")));
-await page.fill("#scene", "no-such-scene");
-await page.click("#scene-form button");
+await choose("scene", "no-such-scene");
 say("a scene that is not there", (await told("no-such-scene")) && (await statusIs((s) => s.scene === "grey")));
-say("scenes to choose from", await page.evaluate(() => document.querySelectorAll("#scenes option").length));
-await page.fill("#scene", "demo");
-await page.click("#scene-form button");
+await choose("scene", "demo");
 say("scene back", (await told("scene: done")) && (await statusIs((s) => s.scene === "demo")));
 // The place, the model, a playlist.
 await page.fill("#p-right", "60");
@@ -114,20 +121,16 @@ await page.fill("#p-scale", "1001");
 say("a scale out of range", await shows("#placed", "Scale: must be a number from 0.001 to 1000") && (await now()).placing.scale === 1.2345);
 await page.click("#place-reset");
 say("as configured", await statusIs((s) => s.placing.turntable_per_min === 0 && s.placing.offset_m[1] === 0));
-await page.fill("#model", "sart");
-await page.keyboard.press("Enter");
+await choose("model", "sart");
 say("another model", (await told("model: done")) && (await statusIs((s) => s.model.startsWith("sart"))));
-await page.fill("#model", "fast");
-await page.click("#model-form button");
+await choose("model", "fast");
 say("the model back", (await told("model: done")) && (await statusIs((s) => s.model.startsWith("fast"))));
-await page.fill("#scene", playlist);
-await page.click("#scene-form button");
+await choose("scene", playlist);
 say("a playlist", (await told("scene: done")) && (await statusIs((s) => s.playlist && s.playlist.entries.length === 2 && s.content.includes("flat (1 of 2)"))) &&
   (await until(async () => (await page.textContent("#list-told")).includes("1 of 2"))));
 await page.click("[data-command=next]");
 say("the next one", (await told("next: done")) && (await statusIs((s) => s.content.includes("grey (2 of 2)"))));
-await page.fill("#scene", "demo");
-await page.click("#scene-form button");
+await choose("scene", "demo");
 say("from a playlist to a scene", (await told("scene: done")) && (await statusIs((s) => s.scene === "demo" && !s.playlist)));
 await page.click("[data-command=blackbox]");
 say("black box", (await told("blackbox: done: /")) && (await page.textContent("#told")).endsWith(".mcap"));

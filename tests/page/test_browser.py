@@ -17,6 +17,8 @@ from typing import Any
 
 import pytest
 
+from runtime.content.presets import preset_names
+from runtime.content.scenes import SCENES
 from runtime.daemon.client import NotRunning, ask
 from tests.page.rig import CONFIGURATION, ROOT, page_of, short_folder
 from tests.waiting import PATIENT, eventually
@@ -25,6 +27,7 @@ pytestmark = pytest.mark.slow
 
 CONTROLS = (
     "state is shown", "pictures are shown", "pause", "resume", "flat", "resume by the keyboard", "reload", "scene",
+    "and those that need data are named",
     "a scene that is not there", "scene back", "black box", "it says that the daemon is gone",
     "it says that the daemon hangs", "it goes on when it hangs no more",
     "moved at once", "turntable", "any scale", "a scale out of range", "as configured",
@@ -39,7 +42,9 @@ class RunningDaemon:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        (folder / "d.toml").write_text(CONFIGURATION.format(width=480, height=270))
+        library = f'[content]\nlibrary = "{folder / "library"}"\n'
+        (folder / "library").mkdir()
+        (folder / "d.toml").write_text(CONFIGURATION.format(width=480, height=270) + library)
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
@@ -84,7 +89,7 @@ def tried(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
         daemon = RunningDaemon(folder)
         daemon.start()
         script = Path(__file__).with_name("drive.mjs")
-        playlist = folder / "two.toml"
+        playlist = folder / "library" / "two.toml"
         playlist.write_text('[[show]]\nscene = "flat"\nseconds = 300\n[[show]]\nscene = "grey"\nseconds = 300\n')
         command = ["node", str(script), page.origin, page.token, str(pictures), str(playlist)]
         results: dict[str, Any] = {}
@@ -118,7 +123,10 @@ def test_figures_pictures_plots_and_eyes_move(tried: dict[str, Any]) -> None:
 
 
 def test_scenes_log_and_states_are_listed(tried: dict[str, Any]) -> None:
-    assert tried["scenes to choose from"] >= 10
+    scenes = [name for name in tried["every scene in the list works"] if name != "\u2026"]
+    assert {*SCENES, "program"} <= set(scenes) and not set(preset_names()) & set(scenes)
+    assert {Path(name).name for name in scenes if name.startswith("/")} == {"two.toml"}, "the library is in the list"
+    assert tried["models to choose from"] == ["fast", "balanced", "best", "sart", "\u2026"]
     assert min(tried["log and states"]) >= 2
 
 

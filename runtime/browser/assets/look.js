@@ -7,8 +7,8 @@ const MODES = [ // key, name, group, hint
   ["parallel", "Side by side", "Eyes", "Look through the screen. The left picture is for the left eye."],
   ["crossed", "Crossed", "Eyes", "Cross your eyes. The left picture is for the right eye."],
   ["anaglyph", "Red and cyan", "Eyes", "For glasses with a red left lens and a cyan right lens."],
-  ["left", "Left eye", "Eyes", ""],
-  ["right", "Right eye", "Eyes", ""],
+  ["left", "Left eye", "Eyes", "What the left eye sees. Move the head to see around things."],
+  ["right", "Right eye", "Eyes", "What the right eye sees. Move the head to see around things."],
   ["panels", "Each panel", "Panels", "What each panel shows, from rear to front."],
   ["apart", "Drawn apart", "Panels", "Shows one point of the picture and its rays to both eyes. Point elsewhere to choose another."],
   ["target", "Target", "Check", "What each eye should see from the head position the layers were solved for."],
@@ -26,7 +26,7 @@ const REST_MS = 200, REST_RAYS = 5, STRIPS = 12, WIGGLE_MS = 280, REPORT_MS = 12
 const PAGE = `
 <div class="stage"><canvas tabindex="0" aria-label="What the eyes see. Arrow keys move the head; + and - move it nearer and farther."></canvas>
 <svg class="over" aria-hidden="true"></svg><div class="names" aria-hidden="true"></div><p class="notice" role="status" hidden></p></div>
-<aside><h1></h1><p class="how">Move your head with the pointer, a finger or the arrow keys. Scroll to move it nearer or farther.</p><div class="modes"></div><p class="hint"></p>
+<aside><h1></h1><p class="how">Move your head with the pointer, a finger or the arrow keys. Scroll to move it nearer or farther.</p><div class="first"></div><div class="modes"></div><p class="hint"></p>
 <div class="switches"><label><input type="checkbox" data-key="aligned" checked> outer panels follow the head</label>
 <label><input type="checkbox" data-key="pupil"> pupils 4 mm wide</label><button type="button" class="quiet">Reset head</button></div>
 <p class="head" role="status"></p><p class="light"></p><div class="point"></div>
@@ -365,11 +365,12 @@ export class Look {
         this.point = at.map((v, k) => Math.max(-0.49 * [width_m, height_m][k], Math.min(0.49 * [width_m, height_m][k], v)));
         return this.draw();
       }
-      if (event.pointerType === "mouse") return this.moveTo([this.head[0], x * REACH_M[0], y * REACH_M[1]]);
+      const closer = this.#closer(this.head[0]);
+      if (event.pointerType === "mouse") return this.moveTo([this.head[0], x * REACH_M[0] * closer, y * REACH_M[1] * closer]);
       if (!before) return;
       const [a, b] = point(before), other = [...fingers.values()].find((f) => f.pointerId !== event.pointerId);
       fingers.set(event.pointerId, event);
-      if (!other) return this.moveTo([this.head[0], this.head[1] + (x - a) * REACH_M[0], this.head[2] + (y - b) * REACH_M[1]]);
+      if (!other) return this.moveTo([this.head[0], this.head[1] + (x - a) * REACH_M[0] * closer, this.head[2] + (y - b) * REACH_M[1] * closer]);
       const apart = (one) => Math.hypot(one.offsetX - other.offsetX, one.offsetY - other.offsetY);
       this.#nearer((apart(before) - apart(event)) / canvas.clientWidth);
     });
@@ -398,7 +399,15 @@ export class Look {
 
   #nearer(metres) {
     const least = this.stack.x_m.at(-1) + 0.1 - middle(this.eyesAt([0, 0, 0]))[0];
-    this.moveTo([Math.max(least, Math.min(1.5, this.head[0] + metres)), this.head[1], this.head[2]]);
+    const out = Math.max(least, Math.min(1.5, this.head[0] + metres)), scale = this.#closer(out) / this.#closer(this.head[0]);
+    this.moveTo([out, this.head[1] * scale, this.head[2] * scale]);
+  }
+
+  // How far a head at this distance moves to the side, relative to one at the usual distance. A near head sees the panels
+  // at up to 60 degrees, and if it also looked from the side, they would be slivers.
+  #closer(out) {
+    const usual = middle(this.eyesAt([0, 0, 0]))[0];
+    return Math.min(1, ((usual + out) / usual) ** 2);
   }
 
   // Functions that every page makes available to scripts (docs/contracts.md).

@@ -1,5 +1,6 @@
 // Script for the live display, which shows the panels. The pointer acts as the head seen by the daemon's sensor.
 import { Look } from "/look.js";
+import { Choice, MORE, modelsOf, scenesOf } from "/choice.js";
 import { ask, token } from "/session.js";
 
 // AGAIN_MS: how often a resting head's position is sent again.
@@ -8,12 +9,16 @@ const AGAIN_MS = 500, STATUS_MS = 500, RETRY_MS = 1000, KEPT = 600;
 const PLACE_M = [0.6, 0, 0];
 // A quick head's peak acceleration, the duration of its shortest movement, and the time between samples.
 const PEAK_M_S2 = 12, LEAST_S = 0.1, STEP_MS = 12;
+const FIRST = `
+<form><label>Scene <select name="scene"></select></label>
+<label>File or folder <input type="text" name="scene_file" autocomplete="off" placeholder="/home/me/model.glb"></label>
+<label>Model <select name="model"></select></label>
+<label>ONNX file <input type="text" name="model_file" autocomplete="off" placeholder="/home/me/model.onnx"></label>
+<label>Gap between panels, 1 to 500 mm <input type="number" name="gap_mm" min="1" max="500" step="any" required></label></form>
+<p class="told" role="status"></p>${MORE}`;
 const CONTROLS = `
 <dl class="figures"></dl>
-<form><label>Scene <input type="text" name="scene" list="scenes" autocomplete="off"></label><datalist id="scenes"></datalist>
-<label>Model <select name="model"></select></label>
-<label>Gap between panels, mm <input type="number" name="gap_mm" min="1" max="500" step="1"></label>
-<label>Sensor noise, mm <input type="number" name="noise_mm" min="0" max="50" step="0.1"></label>
+<form><label>Sensor noise, mm <input type="number" name="noise_mm" min="0" max="50" step="0.1"></label>
 <label>Sensor latency, ms <input type="number" name="latency_ms" min="0" max="1000" step="5"></label>
 <label>Distance between eyes, mm <input type="number" name="ipd_mm" min="45" max="80" step="1"></label>
 <label>Turntable, turns per minute <input type="number" name="turntable" min="-60" max="60" step="1" value="0"></label>
@@ -22,12 +27,14 @@ const CONTROLS = `
 <figure class="found" hidden><svg role="img" aria-label="Camera picture with the detected pupils"></svg><figcaption></figcaption></figure>
 <label class="tick"><input type="checkbox" name="held"> pause the solver, so that only the alignment follows the head</label>
 <label class="tick"><input type="checkbox" name="lost"> hide the viewer's eyes, as if the viewer had left</label></form>
-<p class="told" role="status"></p><p><a href="/operator">Open the operator's page</a></p>`;
+<p><a href="/operator">Open the operator's page</a></p>`;
 
 let look = null, socket = null, viewer = false, sensor = true, lastSent = 0, follows = null, ipd_m = 0.063, newest = null, pending = null;
 let checks = false, camera = null, lookedAt = null;
 // wishes: number of commands in progress. answered_ms: when the last command ended.
 // measured: number of the measured refresh whose target pictures are loaded.
+// used: numbers in use, by field name. restarting: why the daemon restarts, and whether it has begun to.
+let choices = {}, used = {}, restarting = null;
 let layersSeen = { solved: false, flat: false }, first = null, wishes = 0, answered_ms = 0, measured = null;
 const latencies = [], drawn = [];
 const main = document.querySelector("main");
@@ -84,6 +91,25 @@ function see() {
 const form = (name) => main.querySelector(`[name=${name}]`);
 const told = (text) => (main.querySelector(".told").textContent = text);
 
+// Send a number if it is within the field's range. If not, report the range and show the number in use.
+function set(field) {
+  const { name, min, max, parentElement: { textContent: label } } = field;
+  if (field.checkValidity()) {
+    if (name === "gap_mm" && Number(field.value) !== used.gap_mm) restarts(`Restarting with a gap of ${field.value} mm …`);
+    used[name] = Number(field.value);
+    told("");
+    return say({ [name]: used[name] });
+  }
+  told(`${label.split(",")[0].trim()}: must be a number from ${min} to ${max}`);
+  field.value = used[name];
+}
+
+// The panels go on showing the last picture until the daemon has restarted.
+function restarts(text) {
+  restarting = { text, begun: false };
+  look.notice(text);
+}
+
 async function wish(command, value = null) {
   told(`${command} …`);
   wishes += 1;
@@ -105,21 +131,27 @@ function build({ stack, fov_deg }) {
   look.live = true;
   look.onhead = follow;
   look.onmode = check;
+  main.querySelector(".first").innerHTML = FIRST;
   main.querySelector(".more").innerHTML = CONTROLS;
-  for (const [name, value] of [["noise_mm", 0.2], ["latency_ms", 0], ["ipd_mm", ipd_m * 1000]]) form(name).value = value;
-  for (const name of ["noise_mm", "latency_ms", "gap_mm", "camera_fov_deg"]) form(name).addEventListener("change", (event) => say({ [name]: Number(event.target.value) }));
+  choices = {
+    scene: new Choice(form("scene"), form("scene_file"), { text: "another file or folder …" }),
+    model: new Choice(form("model"), form("model_file"), { text: "an ONNX file …" }),
+  };
+  for (const [name, value] of [["noise_mm", 0.2], ["latency_ms", 0], ["ipd_mm", ipd_m * 1000]]) form(name).value = used[name] = value;
+  used.camera_fov_deg = 65;
+  for (const name of ["noise_mm", "latency_ms", "gap_mm", "camera_fov_deg"]) form(name).addEventListener("change", (event) => set(event.target));
   look.notice("Solving the first picture …");
   form("ipd_mm").addEventListener("change", (event) => {
     ipd_m = Math.max(45, Math.min(80, Number(event.target.value))) / 1000;
     look.moveTo(look.head);
   });
-  form("scene").addEventListener("change", (event) => wish("scene", event.target.value));
-  form("model").addEventListener("change", (event) => wish("model", event.target.value));
+  for (const [name, choice] of Object.entries(choices))
+    for (const field of [choice.select, choice.other]) field.addEventListener("change", () => choice.value && wish(name, choice.value));
   form("turntable").addEventListener("change", (event) => wish("place", { turntable_per_min: Number(event.target.value) }));
   form("held").addEventListener("change", (event) => wish(event.target.checked ? "pause" : "resume"));
   form("lost").addEventListener("change", see);
   form("camera").addEventListener("change", (event) => film(event.target.checked));
-  main.querySelector("form").addEventListener("submit", (event) => event.preventDefault());
+  for (const each of main.querySelectorAll("form")) each.addEventListener("submit", (event) => event.preventDefault());
   look.onframe = painted;
   follow();
   about();
@@ -245,7 +277,8 @@ function load(bytes) {
   }
   if (target) measured = frame;
   layersSeen[kind] = true;
-  if (kind === "solved" && (target || !checks)) look.notice("");
+  if (kind === "solved" && restarting?.begun) restarting = null;
+  if (kind === "solved" && (target || !checks) && !restarting) look.notice("");
   if (kind === "solved") look.scene.eyes_m = solved_for_m ?? look.scene.eyes_m;
   look.draw();
   say({ drawn: true });
@@ -260,16 +293,17 @@ function connect() {
     if (message.layers) pending = message;
     else if (message.stack) {
       layersSeen = { solved: false, flat: false };
+      if (restarting) restarting.begun = true;
       measured = null;
       sensor = message.is_sensor;
       const same = look && ["width_px", "height_px"].every((k) => look.stack[k] === message.stack[k]) && look.stack.x_m.length === message.stack.x_m.length;
-      if (same) look.turnTo(message.stack), look.notice("Solving the first picture …");
+      if (same) look.turnTo(message.stack), look.notice(restarting?.text ?? "Solving the first picture …");
       else build(message);
       look.$(".how").hidden = !sensor;
       form("camera").checked = message.is_camera;
       form("camera_fov_deg").parentElement.hidden = sensor;
       if (sensor) main.querySelector(".found").hidden = true;
-      form("gap_mm").value = Math.round(1e5 * (message.stack.x_m[1] - message.stack.x_m[0])) / 100;
+      form("gap_mm").value = used.gap_mm = Math.round(1e5 * (message.stack.x_m[1] - message.stack.x_m[0])) / 100;
       if (checks) say({ checks });
     } else if (message.found) found(message.found);
     else if (message.refresh) take(message);
@@ -289,8 +323,9 @@ async function about() {
   try {
     const answer = await (await ask("/now/about")).json();
     if (!answer.ok) throw new Error(answer.error);
-    main.querySelector("datalist").replaceChildren(...answer.scenes.map((value) => Object.assign(document.createElement("option"), { value })));
-    form("model").replaceChildren(...answer.models.map((value) => Object.assign(document.createElement("option"), { value, textContent: value })));
+    choices.scene.offer(scenesOf(answer));
+    choices.model.offer(modelsOf(answer));
+    main.querySelector(".presets").textContent = answer.presets.join(", ");
   } catch {
     setTimeout(about, RETRY_MS);
   }
@@ -316,7 +351,8 @@ function figures(now, asked_ms) {
     [["dt", name], ["dd", text]].map(([kind, textContent]) => Object.assign(document.createElement(kind), { textContent }))));
   if (wishes || asked_ms < answered_ms) return;
   for (const [name, value] of [["scene", now.scene], ["model", now.model_asked]]) {
-    if (form(name) && document.activeElement !== form(name)) form(name).value = value ?? "";
+    const { select, other, isOther } = choices[name];
+    if (![select, other].includes(document.activeElement) && !(isOther && !other.value)) choices[name].value = value;
   }
   if (form("held")) form("held").checked = Boolean(now.paused);
 }
@@ -326,7 +362,8 @@ async function report() {
     const asked_ms = performance.now(), now = await status();
     const starting = main.querySelector(".starting");
     if (starting && now.reason) starting.textContent = `Starting: ${now.reason}. The first start on a machine takes about ten seconds longer.`;
-    if (look && now.ok) figures(now, asked_ms);
+    if (look && now.ok && now.scene !== undefined) figures(now, asked_ms); // before the first refresh, keep the old figures
+    else if (look && restarting && now.reason) look.notice(`${restarting.text} (${now.reason})`);
   } catch {
     // The failure is reported by the handler for closed connections.
   }

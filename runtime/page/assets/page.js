@@ -1,6 +1,7 @@
 // Script for the operator's page: polls the daemon, draws its state and posts commands. Data is loaded only from the
 // server that delivered the page.
 import { drawPlan } from "/display.js";
+import { Choice, MORE, modelsOf, scenesOf } from "/choice.js";
 import { ask, keep, token } from "/session.js";
 
 const $ = (id) => document.getElementById(id);
@@ -8,6 +9,12 @@ const SVG = "http://www.w3.org/2000/svg";
 const KEPT = 240; // number of points in a plot, which covers two minutes
 const STATUS_MS = 500, PICTURES_MS = 400, LOG_MS = 1000, ABOUT_MS = 5000, RETRY_MS = 1000;
 const ZOOMED_SIGMAS = 20; // radius of the drawn uncertainty: two standard deviations, enlarged ten times
+
+const CHOICES = {
+  scene: new Choice($("scene"), $("scene-file"), { box: $("scene-file").parentElement.parentElement, text: "another file or folder …" }),
+  model: new Choice($("model"), $("model-file"), { box: $("model-file").parentElement.parentElement, text: "an ONNX file …" }),
+};
+$("more").innerHTML = MORE;
 
 let about = null;
 let running = false;
@@ -307,7 +314,7 @@ function show(status) {
   document.querySelector('[data-command="pause"]').setAttribute("aria-pressed", String(status.paused));
   document.querySelector('[data-command="flat"]').setAttribute("aria-pressed", String(status.flat_asked));
   for (const [id, value] of [["scene", status.scene], ["model", status.model_asked]]) {
-    if (document.activeElement !== $(id) && !$(id).dataset.touched) $(id).value = value ?? "";
+    if (document.activeElement !== $(id) && !$(id).dataset.touched) CHOICES[id].value = value;
   }
   $("content-problem").hidden = !status.content_problem;
   setText($("content-problem"), status.content_problem ?? "");
@@ -354,13 +361,9 @@ every(ABOUT_MS, async () => {
   const answer = await lookUp("about");
   if (!answer.ok) return;
   about = answer;
-  for (const id of ["scenes", "models"]) {
-    $(id).replaceChildren(...(answer[id] ?? []).map((name) => {
-      const option = document.createElement("option");
-      option.value = name;
-      return option;
-    }));
-  }
+  CHOICES.scene.offer(scenesOf(answer));
+  CHOICES.model.offer(modelsOf(answer));
+  setText(document.querySelector(".presets"), answer.presets.join(", "));
 });
 
 // Commands.
@@ -395,14 +398,11 @@ async function tell(button, command, value = null, where = $("told")) {
 for (const button of document.querySelectorAll("[data-command]")) {
   button.addEventListener("click", () => tell(button, button.dataset.command, null, $(button.dataset.command === "next" ? "scene-told" : "told")));
 }
-for (const id of ["scene", "model"]) $(id).addEventListener("input", () => ($(id).dataset.touched = "yes"));
-$("scene-form").addEventListener("submit", async (event) => {
-  event.preventDefault();
-  await tell(event.submitter ?? event.target.querySelector("button"), "scene", $("scene").value.trim(), $("scene-told"));
-  delete $("scene").dataset.touched;
-});
-$("model-form").addEventListener("submit", async (event) => {
-  event.preventDefault();
-  await tell(event.submitter ?? event.target.querySelector("button"), "model", $("model").value.trim(), $("model-told"));
-  delete $("model").dataset.touched;
-});
+for (const [id, choice] of Object.entries(CHOICES)) {
+  for (const field of [choice.select, choice.other]) field.addEventListener("input", () => ($(id).dataset.touched = "yes"));
+  $(`${id}-form`).addEventListener("submit", async (event) => {
+    event.preventDefault();
+    await tell(event.submitter ?? event.target.querySelector("button"), id, choice.value, $(`${id}-told`));
+    delete $(id).dataset.touched;
+  });
+}
