@@ -11,12 +11,18 @@ MUTATE_ARGS ?=
 GOLDEN_ARGS ?=
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
+# pip names each package as it is downloaded, with a bar on a terminal.
+PROGRESS := --progress-bar on
 NIGHTLY := out/nightly
 
-.PHONY: demo test test-slow golden lint types secrets coverage nightly package bench fuzz mutate soak install uninstall system eye-models models gallery site hashes clean
+.PHONY: demo test test-setup test-slow golden lint types secrets coverage nightly package bench fuzz mutate soak install uninstall system eye-models models gallery site hashes clean
 
 demo: $(VENV)/.runtime
 	$(BIN)/phasestack demo $(DEMO_ARGS)
+
+# Only install what tests need, so that one test file can be run at once: .venv/bin/python -m pytest tests/optics
+test-setup: $(VENV)/.test
+	@echo "Run one file with: $(BIN)/python -m pytest tests/optics/test_malus.py"
 
 test: $(VENV)/.test lint types
 	$(BIN)/python -m pytest -m "not slow" -n $(TEST_WORKERS) --dist loadfile --max-worker-restart 0 $(PYTEST_ARGS)
@@ -113,14 +119,18 @@ $(VENV)/.created:
 	@touch $@
 
 $(VENV)/.runtime: $(VENV)/.created requirements/runtime.lock pyproject.toml $(wildcard runtime/kernels/*.?pp) | system
-	$(BIN)/python -m pip install --quiet -r requirements/runtime.lock
+	@echo "1 of 2: downloading and installing $$(grep -c == requirements/runtime.lock) packages in $(VENV) (minutes on a slow line)"
+	$(BIN)/python -m pip install $(PROGRESS) -r requirements/runtime.lock
+	@echo "2 of 2: compiling the kernels (a minute on a slow machine)"
 	$(BIN)/python -m pip install --quiet --no-deps --editable .
 	@touch $@
 
 $(VENV)/.test: $(VENV)/.runtime requirements/test.lock requirements/torch.lock
 	@sh systemd/packages.sh test
-	$(BIN)/python -m pip install --quiet -r requirements/test.lock
-	$(BIN)/python -m pip install --quiet -r requirements/torch.lock
+	@echo "1 of 2: downloading and installing $$(grep -c == requirements/test.lock) packages for tests"
+	$(BIN)/python -m pip install $(PROGRESS) -r requirements/test.lock
+	@echo "2 of 2: downloading and installing torch for the CPU (200 MB)"
+	$(BIN)/python -m pip install $(PROGRESS) -r requirements/torch.lock
 	@touch $@
 
 $(VENV)/.docs: $(VENV)/.test requirements/docs.lock

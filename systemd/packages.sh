@@ -20,7 +20,7 @@ if [ "$(id -u)" != 0 ]; then
   echo "Packages are missing; run as root: apt-get install$missing"
   exit 0
 fi
-echo "Installing Debian packages:$missing"
+echo "Installing Debian packages (minutes on a slow line):$missing"
 export DEBIAN_FRONTEND=noninteractive
 # shellcheck disable=SC2086
 { apt-get update -qq && apt-get install -y -qq --no-install-recommends $missing; } >/dev/null \

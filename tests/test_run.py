@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -185,6 +186,16 @@ def test_kept_light_is_what_the_panels_show_with_what_the_judge_needs(runs: tupl
     assert np.array_equal(last, read_image(runs[0] / "layer-0.png"))  # the run's own last picture is the aligned one
 
 
+def test_a_looping_recording_plays_once_at_maximum_speed(tmp_path: Path) -> None:
+    recording, config = recorded(tmp_path / "head.mcap", evenly(60, 0.5)), tmp_path / "loop.toml"
+    config.write_text(f'[sensor]\ndriver = "replay"\nsource = "{recording}"\nloop = true\n[model]\nname = "fast"\n')
+    common = ("run", "--config", str(config), "--headless", "--scale", "0.05", "--max-speed", "--json")
+    told = subprocess.run(
+        [sys.executable, "-m", "runtime.cli", *common], check=True, timeout=120, capture_output=True, text=True
+    )
+    assert json.loads(told.stdout)["stopped"] == "the recording has ended"
+
+
 SLOWEST_HZ, FASTEST_HZ = 15, 240
 
 
@@ -237,9 +248,9 @@ def test_real_and_simulated_time_pass_the_same_states(tmp_path: Path) -> None:
     common = ("run", "--config", str(config), "--replay", str(recording), "--headless", "--scale", "0.05")
     passed = {}
     for name, more in (("simulated", ["--max-speed"]), ("real", [])):
-        command = [sys.executable, "-c", PATIENT, *common, *more, "--out", str(tmp_path / name)]
+        command = [sys.executable, "-c", PATIENT, *common, *more, "--verbose", "--out", str(tmp_path / name)]
         told = subprocess.run(command, check=True, timeout=120, capture_output=True, text=True).stdout
-        assert ("not measured:" in told) == (name == "simulated") and "for a head at rest, quote light_db" in told
+        assert ("not measured:" in told) == (name == "simulated") and "(light_db)" in told
         passed[name] = states_passed(lines_of(tmp_path / name))
     # In real time the sensor's first sample may be there before the first refresh, or not.
     assert passed["real"][-4:] == passed["simulated"][-4:] == ["tracking", "holding", "flat", "tracking"]
@@ -249,14 +260,21 @@ def test_real_and_simulated_time_pass_the_same_states(tmp_path: Path) -> None:
     assert "fps" in simulated["configured"] and real["configured"] == [] and real["clock"] == "real"
 
 
-def test_the_demo_ends_in_time_and_names_its_simulated_clock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_demo_ends_in_time_and_says_so_with_one_figure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr("runtime.commands.demo.LONGEST_S", 0.0)
     monkeypatch.setattr("runtime.commands.demo.LEAST", 4)
     monkeypatch.setattr("runtime.daemon.drive.drive", lambda s, o, host: drive(s, replace(o, scale=0.1), host))
     with pytest.raises(SystemExit):
         app(["demo", "--out", str(tmp_path)])
     summary = json.loads((tmp_path / "summary.json").read_text())
-    assert summary["frames"] == 4 and summary["light_db"] and "reached the time limit of" in summary["stopped"]
+    assert summary["frames"] == 4 and summary["light_db"]
+    assert "time limit of 0 s ended the demo after 4 of 42 refreshes" in summary["stopped"]
+    told = capsys.readouterr().out
+    assert "ended      the time limit of 0 s ended the demo after 4 of 42 refreshes" in told and "4 of 42" in told
+    assert len(re.findall(r"[\d.]+ dB|_db ", told)) == 1, "one figure of quality"
+    assert re.search(r"\d steps? on (all pixels|half the rows and columns)", told) and "1/1+" not in told
     assert (summary["clock"], summary["scene"]) == ("simulated", "room")
     assert list(summary)[:2] == ["clock", "configured"]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,6 +17,13 @@ app = typer.Typer(
 )
 
 Config = Annotated[Path | None, typer.Option(help="configuration file that names the daemon's socket")]
+_given_before: ContextVar[Path | None] = ContextVar("config", default=None)  # `--config` before the subcommand
+
+
+@app.callback()
+def before_the_subcommand(config: Config = None) -> None:
+    """Keep an option that stands before the subcommand: `ctl --config FILE pause`."""
+    _given_before.set(config)
 
 
 @app.command()
@@ -119,6 +127,7 @@ def tell(request: dict[str, Any], config: Path | None) -> None:
     from runtime.errors import InputError
     from runtime.support.figures import lines_of
 
+    config = config or _given_before.get()
     try:
         answer = ask(sockets(config), request, timeout_s=ANSWERED_WITHIN_S)
     except NotRunning as error:
@@ -144,14 +153,14 @@ def status(
     config: Config = None,
     as_json: Annotated[bool, typer.Option("--json", help="print the status as a JSON object")] = False,
 ) -> None:
-    """Show the daemon's state and the reason for it, rates, eye positions, uncertainty, times and faults.
+    """Show the daemon's state and the reason for it, what it shows, rates, quality and faults; then all figures.
 
     Exits with 1 if no daemon answers, or if its loop has been hanging for five seconds.
 
     Example: phasestack status --json
     """
+    from runtime.commands.status_text import status_lines
     from runtime.daemon.client import HUNG_AFTER_S, NotRunning, ask, sockets
-    from runtime.support.figures import shown
 
     try:
         answer = ask(sockets(config), {"command": "status"})
@@ -159,7 +168,7 @@ def status(
         problem = _advised(error)
         typer.echo(json.dumps({"ok": False, "error": problem}) if as_json else problem, err=not as_json)
         raise typer.Exit(1) from None
-    typer.echo(shown(answer, as_json=as_json))
+    typer.echo(json.dumps(answer) if as_json else "\n".join(status_lines(answer)))
     if float(answer.get("turn_age_s", 0.0)) > HUNG_AFTER_S:
         typer.echo(
             f"the display loop has not responded for {answer['turn_age_s']:.0f} s; see journalctl -u phasestack",

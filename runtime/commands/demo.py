@@ -19,6 +19,7 @@ def demo(
         int,
         typer.Option(min=1, help="number of refreshes to show (the full recording has 600 and takes several minutes)"),
     ] = FRAMES,
+    verbose: Annotated[bool, typer.Option("--verbose", help="print all figures of the summary")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print the summary as a JSON object")] = False,
 ) -> None:
     """Play a built-in recording of a moving head through the whole pipeline without a screen.
@@ -41,7 +42,9 @@ def demo(
         def stop_reason(self) -> str:
             self._asked += 1
             is_over = self._asked >= LEAST and time.monotonic() > self._ends_s
-            return f"reached the time limit of {LONGEST_S:g} s" if is_over else ""
+            more = f"--frames {FRAMES + 1} has no limit"
+            shown = f"after {self._asked} of {frames} refreshes"
+            return f"the time limit of {LONGEST_S:g} s ended the demo {shown}; {more}" if is_over else ""
 
     every = MEASURED_EVERY if frames <= 4 * FRAMES else 60  # one measurement takes as long as ten refreshes
     settings = changed(Settings(), "loop", {"evaluate_every": every}, source="demo")
@@ -50,5 +53,5 @@ def demo(
     if as_json:
         typer.echo(json.dumps(summary))
     else:
-        print_summary(summary, out)
+        print_summary(summary, out, asked=frames, verbose=verbose)
     refuse_lost_output(summary)

@@ -45,6 +45,7 @@ def run(
     keep_light: Annotated[
         int, typer.Option(min=0, help="write the layers to the --out folder every N refreshes (0 for never)")
     ] = 0,
+    verbose: Annotated[bool, typer.Option("--verbose", help="print all figures of the summary")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print the summary as a JSON object")] = False,
 ) -> None:
     """Run the display until SIGTERM. SIGHUP reloads the configuration.
@@ -86,5 +87,5 @@ def run(
     if as_json:
         typer.echo(json.dumps(summary))
     elif "frames" in summary and "NOTIFY_SOCKET" not in os.environ:
-        print_summary(summary, out)
+        print_summary(summary, out, asked=frames, verbose=verbose)
     refuse_lost_output(summary)

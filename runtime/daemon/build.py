@@ -174,7 +174,9 @@ def build_run(
     def make_driver() -> Sensor:
         if options.browser is not None and (options.browser.is_sensor or options.browser.is_camera):
             return (BrowserEyes if options.browser.is_sensor else BrowserCamera)(options.browser, clock)
-        return open_sensor(settings.sensor, clock, latency_ms=settings.loop.sensor_latency_ms)
+        # On a simulated clock, a run would never end if its recording began again.
+        sensor = settings.sensor.model_copy(update={"loop": False}) if simulated else settings.sensor
+        return open_sensor(sensor, clock, latency_ms=settings.loop.sensor_latency_ms)
 
     def make_find() -> FindEyes:
         finder = EyeFinder(settings)

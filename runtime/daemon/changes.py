@@ -30,6 +30,9 @@ NEEDS_RESTART = (
     "calibration.ipd_m",
 )  # settings read only when a run starts
 
+# What a refusal begins with although the command itself says it.
+OWN_PREFIX = {"scene": "content: scene: ", "model": "model: name: ", "place": "place: "}
+
 
 @dataclass(frozen=True, slots=True)
 class Choices:
@@ -190,6 +193,7 @@ class Changes:
             command: Command to answer.
             problem: Why the command was refused, or an empty string if it succeeded.
         """
+        problem = problem.removeprefix(OWN_PREFIX.get(command.name, ""))
         self.refused = problem
         if problem:
             log.error("change refused: %s", problem)

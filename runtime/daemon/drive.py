@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from runtime.daemon.build import Host, Run, RunOptions, build_run
 from runtime.errors import FatalError
 from runtime.evaluation.run_output import RunOutput
 from runtime.optics.alignment import shown_layers
-from runtime.records import U8, RefreshAccount
+from runtime.records import U8, RefreshAccount, effort_in_words
 from runtime.support import progress
 from runtime.support.background import wait_for_all
 from runtime.support.figures import lines_of
@@ -79,8 +80,54 @@ def _unseen(layers: U8, account: RefreshAccount, run: Run, settings: Settings) -
     return viewer_html(layers, (), stack, eyes_m=eyes_m, fov_deg=fov_deg, text=[title], follows=not is_flat)
 
 
-def print_summary(summary: dict[str, Any], out: Path | None) -> None:
-    """Print the summary in readable form, which figures to quote, and where to look at the result."""
+def print_summary(
+    summary: dict[str, Any], out: Path | None, *, asked: int | None = None, verbose: bool = False
+) -> None:
+    """Print what a run came to, with one figure of quality, and where to look at the result.
+
+    Args:
+        summary: The run's summary.
+        out: The run's output folder.
+        asked: Number of refreshes that were to be shown. None: as many as there are.
+        verbose: Print all figures first.
+    """
+    if verbose:
+        _print_figures(summary)
+    for line in headline_lines(summary, asked=asked):
+        print(line)
+    written = out is not None and "output_problem" not in summary
+    if written:
+        print(f"see {out}/contact-sheet.png, or open {out}/viewer.html to look around")
+    if not verbose:
+        print(f"all figures: --verbose{f', or {out}/summary.json' if written else ''}")
+
+
+def headline_lines(summary: dict[str, Any], *, asked: int | None = None) -> Iterator[str]:
+    """Yield the lines that everybody needs: the quality, how much was shown, how it was solved, and what went wrong."""
+    live_db, light_db, view_mm = summary["live_db"], summary["light_db"], (summary["view_error_mm"] or {}).get("p50")
+    if live_db is not None:
+        late = "" if view_mm is None else f"; the view lags {view_mm:.1f} mm behind the head (median)"
+        yield f"quality    {live_db:.1f} dB: light at the moving eyes, against what they should see (live_db){late}"
+    elif light_db is not None:
+        yield f"quality    {light_db:.1f} dB: light at the eyes, with a tracking error of 1 mm (light_db)"
+    elif summary["inferences"]:
+        yield "quality    not measured"
+    else:
+        yield "quality    nothing to measure: no viewer was seen, or --frames ended the run too early"
+    of = f" of {asked}" if asked is not None else ""
+    pace = "" if summary["configured"] else f" at {summary['fps']:.1f} a second"
+    lost = f", {summary['dropped']} dropped" if summary["dropped"] else ""
+    yield f"shown      {summary['presented']}{of} refreshes{pace}{lost}; {summary['inferences']} solutions"
+    efforts = sorted((summary["efforts"] or {}).items(), key=lambda item: -item[1])
+    total_s = sum(seconds for _, seconds in efforts)
+    shares = [f"{effort_in_words(name)} for {100 * seconds / total_s:.0f}%" for name, seconds in efforts if seconds > 0]
+    yield f"model      {summary['model']} on the {summary['backend']}{': ' if shares else ''}{', '.join(shares)}"
+    states = [f"{name} {seconds:.1f} s" for name, seconds in summary["states"].items() if seconds >= 0.05]
+    yield f"states     {', '.join(states)}"
+    yield f"ended      {summary['stopped']}"
+
+
+def _print_figures(summary: dict[str, Any]) -> None:
     configured = summary["configured"]
     for line in lines_of({name: value for name, value in summary.items() if name not in (*configured, "configured")}):
         print(line)
@@ -88,17 +135,6 @@ def print_summary(summary: dict[str, Any], out: Path | None) -> None:
         print("these figures were configured for the simulated clock and not measured:")
         for line in lines_of({name: summary[name] for name in configured}):
             print(f"  {line}")
-    if summary["live_db"] is not None:
-        print("for a moving head, quote live_db (the light PSNR at the true eyes against the target of each refresh)")
-    if summary["light_db"] is not None:
-        print(
-            "for a head at rest, quote light_db (the light PSNR at the eye positions used, with a tracking error of 1 "
-            "mm)"
-        )
-    if not summary["inferences"]:
-        print("no solution was shown because no viewer was seen or because --frames ended the run too early")
-    if out is not None and "output_problem" not in summary:
-        print(f"see {out}/contact-sheet.png, or open {out}/viewer.html to look around")
 
 
 def refuse_lost_output(summary: dict[str, Any]) -> None:

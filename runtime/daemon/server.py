@@ -201,7 +201,8 @@ class StatusServer:
         if isinstance(answer, Command):
             if _is_gone(writer):
                 raise Refusal("the command was not run")
-            log.info("command: %s", answer.name if answer.value is None else f"{answer.name} {answer.value}")
+            value = "" if answer.value is None else f" {answer.value}"
+            log.info(f"command: {answer.name}{value}")
             self.commands.put(answer)
             answer = await _outcome(answer, writer)
         return _line(answer)

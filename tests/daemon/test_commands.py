@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import threading
 from pathlib import Path
@@ -17,9 +18,12 @@ from runtime.commands import ctl
 from runtime.commands.ctl import status
 from runtime.daemon.server import StatusServer
 from runtime.errors import InputError
+from runtime.support.logs import RateLimit
 
 ACCOUNT = {
     "state": "degraded: sensor", "reason": "sensor: unplugged", "missing": {"sensor": "unplugged"}, "fps": 31.25,
+    "scene": "room", "model": "fast", "fps_now": 31.5, "solutions_per_s_now": 0.0, "light_db": 33.5,
+    "effort": "1/2+1", "efforts": {"1/2+1": 3.0},
     "frames": 100, "presented": 98, "dropped": 2,
     "stage_ms": {"render": {"p50": 3.0, "p99": 4.0}, "inference": {"p50": 12.0, "p99": 13.0}},
     "eyes_m": [[0.9, -0.03, 0.0], [0.9, 0.03, 0.0]], "eyes_label": "held", "faults": {"sensor": 4},
@@ -59,9 +63,48 @@ def test_people_see_state_reason_rate_eyes_and_faults_and_machines_one_object(se
     assert result.exit_code == 0
     told = " ".join(result.stdout.split())
     for words in ("degraded: sensor", "unplugged", "fps 31.25", "dropped 2", "(0.9 -0.03 0)", "held",
-                  "inference 12", "faults sensor 4", "warp of the centre panel", "reading a.glb"):  # fmt: skip
+                  "inference 12", "4 x sensor", "warp of the centre panel", "reading a.glb",
+                  "effort 1 step on half the rows and columns"):  # fmt: skip
         assert words in told
     assert json.loads(ask_status(server.path, "--json").stdout)["state"] == "degraded: sensor"
+
+
+def test_the_status_begins_with_the_five_lines_that_matter(server: StatusServer) -> None:
+    lines = ask_status(server.path).stdout.splitlines()
+    assert [" ".join(line.split()) for line in lines[:6]] == [
+        "state degraded: sensor (sensor: unplugged)", "shows room with the model fast",
+        "rate 31.5 refreshes/s, 0 solutions/s", "quality 33.5 dB (light_db, at the eyes now)",
+        "faults sensor: unplugged; 4 x sensor since startup", "",
+    ]  # fmt: skip
+    groups = [line for line in lines[5:] if line and not line.startswith(" ")]
+    assert groups == ["scene", "eyes", "solver", "panels", "service"]
+
+
+def test_every_placement_is_in_the_service_s_log(server: StatusServer, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "phasestack")
+    limit, sent = RateLimit(SimulatedClock()), [1.0 + n / 10 for n in range(12)]
+
+    def loop() -> None:
+        for _ in sent:
+            server.commands.get(timeout=60).done()
+
+    thread = threading.Thread(target=loop)
+    thread.start()
+    for scale in sent:
+        ctl.tell({"command": "place", "value": {"scale": scale}}, configuration(server.path))
+    thread.join()
+    passed = [record.getMessage() for record in caplog.records if limit.filter(record)]
+    assert [line for line in passed if line.startswith("command: ")] == [
+        f"command: place {{'scale': {s}}}" for s in sent
+    ]
+
+
+def test_the_configuration_may_stand_before_the_subcommand(server: StatusServer) -> None:
+    thread = threading.Thread(target=lambda: server.commands.get(timeout=60).done(paused=True))
+    thread.start()
+    result = CliRunner().invoke(ctl.app, ["--config", str(configuration(server.path)), "pause"])
+    thread.join()
+    assert (result.exit_code, result.stdout.split()) == (0, ["paused", "yes"])
 
 
 def test_a_loop_that_stands_still_is_a_failure(server: StatusServer, clock: SimulatedClock) -> None:

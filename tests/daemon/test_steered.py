@@ -40,9 +40,9 @@ def test_a_place_that_is_none_is_refused_and_the_scene_stays(tmp_path: Path) -> 
     refusals = [
         ({"offset": 1}, "value.offset: place accepts only scale"),
         ("left", "value: place requires an object"),
-        ({"scale": "large"}, "place: scale:"),
-        ({"scale": 1e9}, "place: scale:"),
-        ({"offset_m": [0, 0]}, "place: offset_m.2:"),
+        ({"scale": "large"}, "scale:"),
+        ({"scale": 1e9}, "scale:"),
+        ({"offset_m": [0, 0]}, "offset_m.2:"),
     ]
     with Served(tmp_path, content={"scene": "sparse"}) as served:
         for value, told in refusals:
@@ -71,6 +71,9 @@ def test_a_playlist_is_shown_and_gone_through(tmp_path: Path) -> None:
         assert not answer["ok"] and "show[0].seconds: " in answer["error"]
         assert served.asked("scene", "flat")["ok"]
         assert "not a playlist" in served.asked("next")["error"]
+        for command, value in (("scene", "nope"), ("model", "nope.onnx"), ("place", {"scale": -1})):
+            error = served.asked(command, value)["error"]
+            assert not error.startswith(("content: ", "model: ", "place: ", "scene: ")), "the command says it already"
 
 
 def test_the_library_is_offered_with_the_scenes(tmp_path: Path) -> None:

@@ -56,6 +56,14 @@ export const scenesOf = ({ scenes, library }) => {
 
 export const modelsOf = ({ models }) => [["", models.map((name) => [name, name])]];
 
+// An effort such as 1/2+1 in words.
+export function effortInWords(name) {
+  const [, reduction, steps] = /^1\/(\d+)\+(\d+)$/.exec(name) ?? [];
+  if (!steps) return name;
+  const raster = { 1: "all pixels", 2: "half the rows and columns", 3: "a third of the rows and columns" }[reduction];
+  return `${steps} ${steps === "1" ? "step" : "steps"} on ${raster ?? `1/${reduction} of the rows and columns`}`;
+}
+
 // What can be shown besides the scenes in the list.
 export const MORE = `<details class="others"><summary>What else can be shown</summary><ul>
 <li>A file or folder on the display's PC: stereo pictures and films, 3D models, Gaussian splats, data sets of views, pictures with depth, playlists.</li>

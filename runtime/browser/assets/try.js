@@ -1,6 +1,6 @@
 // Script for the live display, which shows the panels. The pointer acts as the head seen by the daemon's sensor.
 import { Look } from "/look.js";
-import { Choice, MORE, modelsOf, scenesOf } from "/choice.js";
+import { Choice, MORE, effortInWords, modelsOf, scenesOf } from "/choice.js";
 import { ask, token } from "/session.js";
 
 // AGAIN_MS: how often a resting head's position is sent again.
@@ -340,7 +340,7 @@ function figures(now, asked_ms) {
     "page": drawn.length > 1 && `${drawn.length} pictures per second`,
     "panels": now.fps_now > 0 && `${number(now.fps_now)} refreshes per second`,
     "solver": solves ? `${number(now.solutions_per_s_now)} solutions per second (${now.model})` : now.paused ? "paused" : rests && "idle while the head rests",
-    "effort": solves && now.effort && `${now.effort} (raster and steps)`,
+    "effort": solves && now.effort && effortInWords(now.effort),
     "estimated view error": solves && typeof now.view_error_estimated_now_mm === "number" && `${number(now.view_error_estimated_now_mm)} mm`,
     "solution age": solves && `${number(now.solution_age_now_ms, 0)} ms`,
     "uncertainty of the eyes": typeof now.eye_sigma_now_mm === "number" && `${number(now.eye_sigma_now_mm, 2)} mm (${now.eyes_label})`,

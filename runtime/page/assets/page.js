@@ -1,7 +1,7 @@
 // Script for the operator's page: polls the daemon, draws its state and posts commands. Data is loaded only from the
 // server that delivered the page.
 import { drawPlan } from "/display.js";
-import { Choice, MORE, modelsOf, scenesOf } from "/choice.js";
+import { Choice, MORE, effortInWords, modelsOf, scenesOf } from "/choice.js";
 import { ask, keep, token } from "/session.js";
 
 const $ = (id) => document.getElementById(id);
@@ -122,7 +122,7 @@ function figures(status) {
     sensor: `${number(status.sensor_hz)} samples/s, ${status.stale_inputs} skipped`,
     "capture to light": status.photon_ms ? `${number(status.photon_ms.p50)} ms (p50), ${number(status.photon_ms.p99)} (p99)` : "–",
     "solution age": status.solution_age_ms ? `${number(age(status.solution_age_ms.p50))} ms (p50), ${number(age(status.solution_age_ms.p99))} (p99)` : "–",
-    effort: status.effort ?? "–",
+    effort: status.effort ? effortInWords(status.effort) : "–",
     "view error, estimated": status.view_error_estimated_mm ? `${number(status.view_error_estimated_mm.p50)} mm (p50), ${number(status.view_error_estimated_mm.p95)} (p95)` : "–",
     ...(status.view_error_mm ? { "view error": `${number(status.view_error_mm.p50)} mm (p50), ${number(status.view_error_mm.p95)} (p95)` } : {}),
     ...(typeof status.live_db === "number" ? { "live quality": `${number(status.live_db)} dB at the true eyes` } : {}),
