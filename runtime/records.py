@@ -181,18 +181,6 @@ class Effort:
         return f"1/{self.reduction}+{self.steps}"
 
 
-def effort_in_words(name: str) -> str:
-    """Describe an effort, given its name.
-
-    >>> effort_in_words("1/1+4"), effort_in_words("1/2+1")
-    ('4 steps on all pixels', '1 step on half the rows and columns')
-    """
-    reduction, _, steps = name.removeprefix("1/").partition("+")
-    raster = {"1": "all pixels", "2": "half the rows and columns", "3": "a third of the rows and columns"}
-    rows = raster.get(reduction, f"1/{reduction} of the rows and columns")
-    return f"{steps} {'step' if steps == '1' else 'steps'} on {rows}"
-
-
 @dataclass(frozen=True, slots=True)
 class Measures:
     """Squared errors measured for a solution, with intensities from 0 to 1. None means not measured."""

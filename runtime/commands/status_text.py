@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from runtime.records import effort_in_words
-from runtime.support.figures import in_words, lines_of
+from runtime.support.figures import effort_in_words, in_words, lines_of
 
 # Fields by group, in the order shown. A field in none of them is shown in the last group.
 GROUPS: Mapping[str, tuple[str, ...]] = {

@@ -15,10 +15,10 @@ from runtime.daemon.build import Host, Run, RunOptions, build_run
 from runtime.errors import FatalError
 from runtime.evaluation.run_output import RunOutput
 from runtime.optics.alignment import shown_layers
-from runtime.records import U8, RefreshAccount, effort_in_words
+from runtime.records import U8, RefreshAccount
 from runtime.support import progress
 from runtime.support.background import wait_for_all
-from runtime.support.figures import lines_of
+from runtime.support.figures import effort_in_words, lines_of
 
 JOBS_END_WITHIN_S = 0.5  # how long to wait for background jobs at the end of a run
 USUAL_M, IPD_M = 0.6, 0.063  # a typical viewer's distance and eye separation, used if no viewer was seen

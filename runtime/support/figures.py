@@ -45,3 +45,15 @@ def in_words(value: Any) -> str:
             form = "({})" if any(isinstance(item, list | tuple) for item in value) else "{}"
             return " ".join(form.format(in_words(item)) for item in value)
     return str(value)
+
+
+def effort_in_words(name: str) -> str:
+    """Describe an effort, given its name.
+
+    >>> effort_in_words("1/1+4"), effort_in_words("1/2+1")
+    ('4 steps on all pixels', '1 step on half the rows and columns')
+    """
+    reduction, _, steps = name.removeprefix("1/").partition("+")
+    raster = {"1": "all pixels", "2": "half the rows and columns", "3": "a third of the rows and columns"}
+    rows = raster.get(reduction, f"1/{reduction} of the rows and columns")
+    return f"{steps} {'step' if steps == '1' else 'steps'} on {rows}"

@@ -104,7 +104,7 @@ function set(field) {
   field.value = used[name];
 }
 
-// The panels go on showing the last picture until the daemon has restarted.
+// The panels show the last picture until the daemon has restarted.
 function restarts(text) {
   restarting = { text, begun: false };
   look.notice(text);
