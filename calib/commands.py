@@ -74,8 +74,8 @@ def grey(
     show: Annotated[
         bool, typer.Option("--show", help="show the chart on the panel until Enter or q is pressed")
     ] = False,
-    white_deg: Annotated[float, number(30.0, 90.0, help="angle by which full white turns the polarization")] = 90.0,
-    black_deg: Annotated[float, number(0.0, 29.0, help="angle by which black turns the polarization")] = 0.0,
+    white_deg: Annotated[float, number(1.0, 90.0, help="angle by which full white turns the polarization")] = 90.0,
+    black_deg: Annotated[float, number(0.0, 89.0, help="angle by which black turns the polarization")] = 0.0,
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -95,6 +95,8 @@ def grey(
     if panel >= stack.count:
         raise InputError("calibrate grey", "--panel", f"must be from 0 to {stack.count - 1}")
     if photos is not None and out is not None:
+        if black_deg >= white_deg:
+            raise InputError("calibrate grey", "--black-deg", f"must be less than --white-deg, {white_deg:g}")
         from calib.grey_chart import AngleRange, lut_from_photographs
         from calib.photographs import photographs
 

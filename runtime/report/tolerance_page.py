@@ -273,7 +273,8 @@ def crosstalk_section(sizes: Sequence[Crosstalk], disparities: Sequence[Crosstal
             plot.semilogx(at, [c.percent for c in found], "o-", label="solved")
             if found[0].theory_percent is not None:
                 plot.semilogx(at, [c.theory_percent for c in found], "x--", color="C1", label="theory")
-            plot.xaxis.set_major_formatter("{x:g}")
+            plot.set_xticks(at, [f"{mm:g}" for mm in at])
+            plot.minorticks_off()
             plot.set_xlabel(label)
         axes[0].set_ylabel("crosstalk, %")
         axes[0].legend()
