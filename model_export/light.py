@@ -57,13 +57,14 @@ LEAST_ERROR = 1e-6  # minimum squared error, which limits the PSNR to 60 dB
 class Views:
     """Both eyes' rays through the pixels of a raster, as homographies to the panels.
 
-    Each of the E sets of rays belongs to one eye. The sets alternate between the left and the right eye, and each pair
-    of sets belongs to one head position.
+    Each of the E sets of rays belongs to one view. The sets list all views for each head position in turn.
     """
 
     panels_from_rays: Tensor  # (E, N, 3, 3) float64, from raster to panel pixels; pixel centres at half-integers
     width_px: int  # width of the raster
     height_px: int  # height of the raster
+    views: tuple[int, ...] = ()  # each set's view, if the sets do not list all views in turn
+    turn: tuple[int, ...] = ()  # likewise, the rows that belong to the set: every `turns`-th from this one
 
     @classmethod
     def of(
@@ -173,18 +174,20 @@ def step(
     size: float | Tensor,
     momentum: float | Tensor = MOMENTUM,
     floor: float = FLOOR,
+    grey: Sequence[int] = (),
 ) -> tuple[Tensor, Tensor]:
     """Compute one solver step from (L5).
 
     Args:
         x: Panel values (N, C, H, W).
         y: Values (N, C, H, W) extrapolated from x by the previous step's momentum. Initially they equal x.
-        targets: Target intensities (2, C, h, w) for the left and the right eye. If they have k times as many rows as
-            the views, each of k head positions uses every k-th row.
+        targets: Target intensities (V, C, h, w) for each view. If they have k times as many rows as the rays, the sets
+            take k turns, and each uses every k-th row.
         views: The eyes' rays.
         size: Step size.
         momentum: Momentum used to extrapolate.
         floor: Lower limit for the curvature per set of rays.
+        grey: Panels that have one value for all channels. Their gradient and curvature are means over the channels.
 
     Returns:
         The new panel values x' and their extrapolation y'.
@@ -194,11 +197,15 @@ def step(
     bundles, counts = _bundles(y, views)
     gradient, curvature = torch.zeros_like(y), torch.zeros_like(y)
     for e, z in enumerate(bundles):
-        whole, turn = reduce(torch.mul, z), e // 2 if turns > 1 else 0
-        error = (1 - whole.real) / 2 - targets[e % 2][:, turn::turns][:, : views.height_px]
+        whole = reduce(torch.mul, z)
+        turn = views.turn[e] if views.turn else e // len(targets) if turns > 1 else 0
+        view = views.views[e] if views.views else e % len(targets)
+        error = (1 - whole.real) / 2 - targets[view][:, turn::turns][:, : views.height_px]
         rays = torch.cat([error * whole.imag, whole.imag.square()]) * counts[e]
         g, d = _sample(rays.expand(len(y), -1, -1, -1), back[e], size_px, near_px=-EDGE_CLAMP_PX)[0].chunk(2, dim=1)
         gradient, curvature = gradient + g, curvature + d
+    for n in grey:
+        gradient[n], curvature[n] = gradient[n].mean(dim=0), curvature[n].mean(dim=0)
     new = (y - size * 2 / (torch.pi * len(y)) * gradient / curvature.clamp(min=floor * sets)).clamp(0, 1)
     return new, new + momentum * (new - x)
 
@@ -208,7 +215,7 @@ def improved(panels: Tensor, targets: Tensor, views: Views, sizes: Sequence[Any]
 
     Args:
         panels: Initial panel values (N, C, H, W).
-        targets: Target intensities (2, C, h, w) for the left and the right eye.
+        targets: Target intensities (V, C, h, w) for each view.
         views: The eyes' rays.
         sizes: Each step's size.
         momenta: Each step's momentum.

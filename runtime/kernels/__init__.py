@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-MAX_PANELS = 5
-MAX_SETS = 4  # maximum number of ray sets: both eyes at two head positions
+MAX_PANELS = 6
+MAX_SETS = 16  # maximum number of ray sets: eight views at two head positions
 MARGIN = 64  # elements past the end of a row that the loops may read or overwrite, because they use whole vectors
 SUBCODE = 16  # fixed-point units per 8-bit panel code
 FULL = 255 * SUBCODE  # range of a panel value, which rotates the polarization by up to a quarter turn
@@ -69,9 +69,11 @@ class Problem(ctypes.Structure):
 
     _fields_ = (
         ("panels", _int), ("sets", _int), ("channels", _int), ("height", _int), ("width", _int),
-        ("panels_from_rays", _pointer), ("rays_from_panels", _pointer), ("targets", _pointer * 2),
+        ("turns", _int), ("turn", _int * MAX_SETS),
+        ("panels_from_rays", _pointer), ("rays_from_panels", _pointer), ("targets", _pointer * MAX_SETS),
         ("column_taper", _pointer), ("row_taper", _pointer), ("table", _pointer), ("rest", _float), ("missing", _float),
-        ("panel", Panel * MAX_PANELS), ("size", _float), ("momentum", _float), ("floor", _float),
+        ("panel", Panel * MAX_PANELS), ("grey", _int * MAX_PANELS),
+        ("size", _float), ("momentum", _float), ("floor", _float),
     )  # fmt: skip
 
 

@@ -19,7 +19,7 @@
 constexpr int LANES = 32;     // elements per vector in the loops; the compiler splits vectors as the processor requires
 constexpr int TILE_PX = 256;  // pixels in a row that are sampled together; their data fits in the first-level cache
 constexpr int EDGE_PX = 4;    // maximum distance, in pixels, that an image may be sampled beyond its edge
-constexpr int MAX_PANELS = 5;
+constexpr int MAX_PANELS = 6;
 constexpr int MAX_CHANNELS = 3;
 constexpr int TILE = TILE_PX * MAX_CHANNELS + 2 * LANES;  // elements, including some that may be overwritten at the end
 constexpr int SOURCE = 2 * TILE + MAX_CHANNELS * LANES;   // elements

@@ -15,8 +15,8 @@ constexpr float UNIT = 8100;     // 1 in fixed-point phasors; rounded products m
 constexpr float PI = 3.14159265f;
 constexpr double NEAR_PX = 0.5;  // rays count if they cross every panel at least this far inside its edges
 constexpr double EDGE_CLAMP_PX = 2;  // bundles of rays at the border extend this far beyond the picture (clamp to edge)
-constexpr int MAX_SETS = 4;      // ray sets; the sum of their squared slopes, each at most 7830, fits in 16 bits
-static_assert(FIELDS * MAX_SETS <= 2 * MAX_PANELS, "work has too few tiles to gather all sets");
+constexpr int MAX_SETS = 16;     // ray sets
+static_assert(2 * FIELDS <= 2 * MAX_PANELS, "work has too few tiles to add a set to the sum of the others");
 
 struct Panel {
   Image ahead;   // values with momentum, used to evaluate the rays
@@ -27,28 +27,36 @@ struct Panel {
 };
 
 struct Problem {
-  int32_t panels, sets, channels;  // each head position has two ray sets, one for each eye
-  int32_t height, width;           // size of a set; head positions alternate from one picture row to the next
+  int32_t panels, sets, channels;
+  int32_t height, width;           // size of a set
+  int32_t turns;                   // sets take turns from one picture row to the next: row r of a set is picture row
+  int32_t turn[MAX_SETS];          // r * turns + turn
   const double *panels_from_rays;  // (sets, panels, 3, 3) homographies from a set's rays to panel pixels
   const double *rays_from_panels;  // (sets, panels, 3, 3) inverses of these homographies
-  const uint8_t *targets[2];       // for each eye, (rows of all head positions, width, channels)
+  const uint8_t *targets[MAX_SETS];  // for each set, its picture (rows of all turns, width, channels)
   const int16_t *column_taper;     // (width, channels) weights for the rays' errors; 32767 stands for 1
-  const int16_t *row_taper;        // (rows of all head positions) further weights
+  const int16_t *row_taper;        // (rows of all turns) further weights
   const int32_t *table;            // (256,) the sum of panel values plus 65536 times the weight, for each target code
   float rest, missing;             // for close_middle: value outside the panels, and weight for rays that miss a panel
   Panel panel[MAX_PANELS];
+  int32_t grey[MAX_PANELS];  // for each panel, 1 if it has one value for all channels (no colour filters)
   float size, momentum, floor;
 
-  int places() const { return sets / 2; }
+  int row(int set, int r) const { return r * turns + turn[set]; }
   const uint8_t *target(int set, int r, int64_t at) const {
-    return targets[set % 2] + (int64_t(r) * places() + set / 2) * width * channels + at;
+    return targets[set] + int64_t(row(set, r)) * width * channels + at;
   }
+  // Return how often to halve what is summed over the sets, so that the sums fit in 16 bits. Four squared slopes, each
+  // at most 7830, or four residuals fit.
+  int halvings() const { return sets <= 4 ? 0 : sets <= 8 ? 1 : 2; }
 };
 
 // Return true if the arguments describe a problem that the loops can solve.
 bool solvable(const Problem &problem, int part, int parts) {
-  if (problem.panels < 2 || problem.panels > MAX_PANELS || problem.sets < 2 || problem.sets > MAX_SETS) return false;
-  if (problem.sets % 2 || (problem.channels != 1 && problem.channels != 3)) return false;
+  if (problem.panels < 2 || problem.panels > MAX_PANELS || problem.sets < 1 || problem.sets > MAX_SETS) return false;
+  if (problem.turns < 1 || (problem.channels != 1 && problem.channels != 3)) return false;
+  for (int set = 0; set < problem.sets; ++set)
+    if (problem.turn[set] < 0 || problem.turn[set] >= problem.turns) return false;
   if (problem.height < 1 || problem.width < 1 || part < 0 || part >= parts) return false;
   for (int n = 0; n < problem.panels; ++n)
     if (problem.panel[n].ahead.rows < 1 || problem.panel[n].ahead.width < 1) return false;
@@ -230,7 +238,9 @@ INLINE void compare(const Problem &problem, const Share &share, int set, int r, 
     span = common(span, inside(lines[n], problem.width, problem.panel[n].ahead, NEAR_PX));
   }
   const int16_t one = rounded(unit_of(N)), twice = rounded(512.0f / 255 * unit_of(N));
-  const int16_t row_taper = problem.row_taper[r * problem.places() + set / 2];
+  const int halvings = problem.halvings();
+  const int16_t row_taper = int16_t(problem.row_taper[problem.row(set, r)] >> halvings);
+  const int16_t a = halvings < 2 ? 2 : 1, b = halvings < 1 ? 2 : 1;  // factors of the squared slope
   int tile = TILE_PX;
   for (const Line &line : lines) tile = std::min(tile, tile_px(line, span));
   for (int u = span.first; u < span.last; u += tile) {
@@ -247,12 +257,12 @@ INLINE void compare(const Problem &problem, const Share &share, int set, int r, 
       VECTORISED for (int k = e; k < e + LANES; ++k) {
         int16_t re = work.tile[0][k], im = work.tile[1][k];
         for (int n = 1; n < N; ++n) {
-          const int16_t c = work.tile[2 * n][k], s = work.tile[2 * n + 1][k], a = int16_t(4 * re), b = int16_t(4 * im);
-          re = int16_t(product(a, c) - product(b, s)), im = int16_t(product(a, s) + product(b, c));
+          const int16_t c = work.tile[2 * n][k], s = work.tile[2 * n + 1][k], p = int16_t(4 * re), q = int16_t(4 * im);
+          re = int16_t(product(p, c) - product(q, s)), im = int16_t(product(p, s) + product(q, c));
         }
         const int16_t doubled = product(int16_t(target[k] << 7), twice);
         const int16_t error = product(int16_t(one - re - doubled), product(taper[k], row_taper));  // twice the error
-        curvature[k] = product(int16_t(2 * im), int16_t(2 * im)), gradient[k] = product(error, int16_t(2 * im));
+        curvature[k] = product(int16_t(a * im), int16_t(b * im)), gradient[k] = product(error, int16_t(2 * im));
       }
   }
   clear_outside(problem, share, set, r, span);
@@ -279,7 +289,7 @@ INLINE void gather(const Problem &problem, const Share &share, const Back &back,
     Image images[F];
     for (int f = 0; f < F; ++f) images[f] = share.image(problem, set, f);
     const Span span = common(tile, back.span[set]);
-    int16_t(*out)[TILE] = work.tile + set * F;
+    int16_t(*out)[TILE] = work.tile + (set == 0 ? 0 : F);
     const int begin = std::max(span.first - tile.first, 0) * C, end = std::max(span.last - tile.first, 0) * C;
     for (int u = span.first, length = tile_px(back.line[set], span); u < span.last; u += length)
       sample<F, C>(images, back.line[set], u, std::min(u + length, span.last), work, out, (u - tile.first) * C);
@@ -294,18 +304,28 @@ INLINE void gather(const Problem &problem, const Share &share, const Back &back,
   }
 }
 
+// Replace the first `count` elements by each pixel's mean over the channels.
+template <int C>
+INLINE void mean_of_channels(int16_t *row, int64_t count) {
+  for (int64_t k = 0; C == 3 && k < count; k += 3) {
+    const int16_t mean = int16_t((int(row[k]) + row[k + 1] + row[k + 2]) / 3);
+    row[k] = row[k + 1] = row[k + 2] = mean;
+  }
+}
+
 // Update row q of panel n by a gradient step with momentum (L5).
 template <int C, int N>
 INLINE void move(const Problem &problem, const Share &share, int n, int q, Work &work) {
   const Panel &panel = problem.panel[n];
   const Back back(problem, share, n, q);
-  const float least = problem.floor * float(problem.sets) * unit_of(N) * unit_of(N) / 8192;
+  const float least = problem.floor * float(problem.sets) * unit_of(N) * unit_of(N) / 8192 / float(1 << problem.halvings());
   const float size = problem.size * FULL / (N * PI / 2);
   const int16_t momentum = rounded(32768 * problem.momentum);
   for (int u = 0; u < panel.ahead.width; u += TILE_PX) {
     const Span tile{u, std::min(u + TILE_PX, panel.ahead.width)};
     gather<2, C>(problem, share, back, tile, work);
     const int64_t at = int64_t(u) * C, count = int64_t(tile.last - u) * C;
+    if (problem.grey[n]) mean_of_channels<C>(work.tile[0], count), mean_of_channels<C>(work.tile[1], count);
     const int16_t *ahead = panel.ahead.row(q) + at, *before = panel.before.row(q) + at;
     int16_t *last = const_cast<int16_t *>(panel.last.row(q)) + at, *moved = const_cast<int16_t *>(panel.moved.row(q)) + at;
     for (int e = 0; e < count; e += LANES)
@@ -322,7 +342,7 @@ INLINE void move(const Problem &problem, const Share &share, int n, int q, Work 
 // must correct.
 template <int C>
 INLINE void residual(const Problem &problem, const Share &share, int set, int r, Work &work) {
-  const int middle = problem.panels / 2;
+  const int middle = problem.panels / 2, halvings = problem.halvings();
   const double *homographies = problem.panels_from_rays + set * problem.panels * 9;
   const Span span = inside(Line(homographies + middle * 9, r), problem.width, problem.panel[middle].last, 0);
   Span whole = span;  // rays that cross all panels
@@ -351,7 +371,7 @@ INLINE void residual(const Problem &problem, const Share &share, int set, int r,
       VECTORISED for (int k = e; k < e + LANES; ++k) {
         const int32_t entry = problem.table[target[k]];
         const int16_t left = int16_t(int16_t(entry) - sum[k]);
-        sum[k] = std::min(std::max(left, int16_t(-FULL)), int16_t(2 * FULL)), weights[k] = int16_t(entry >> 16);
+        sum[k] = std::min(std::max(left, int16_t(-FULL)), int16_t(2 * FULL)), weights[k] = int16_t(entry >> (16 + halvings));
       }
     const int begin = std::clamp((whole.first - u) * C, 0, count), end = std::clamp((whole.last - u) * C, begin, count);
     for (int k = 0; k < begin; ++k) weights[k] = rounded(float(weights[k]) * problem.missing);
@@ -371,6 +391,8 @@ INLINE void fill(const Problem &problem, const Share &share, int q, Work &work) 
   for (int u = 0; u < image.width; u += TILE_PX) {
     const Span tile{u, std::min(u + TILE_PX, image.width)};
     gather<2, C>(problem, share, back, tile, work);
+    if (problem.grey[problem.panels / 2])
+      for (int f = 0; f < 2; ++f) mean_of_channels<C>(work.tile[f], int64_t(tile.last - u) * C);
     int16_t *out = const_cast<int16_t *>(image.row(q)) + int64_t(u) * C;
     VECTORISED for (int k = 0; k < (tile.last - u) * C; ++k) {
       const float weight = work.tile[0][k], mean = 8192 * float(work.tile[1][k]) / std::max(weight, 1.0f);
@@ -419,10 +441,12 @@ FOR_EVERY_CPU int32_t step(const Problem *problem, int part, int parts) {
       case 13: step_rows<1, 3>(*problem, share); break;
       case 14: step_rows<1, 4>(*problem, share); break;
       case 15: step_rows<1, 5>(*problem, share); break;
+      case 16: step_rows<1, 6>(*problem, share); break;
       case 32: step_rows<3, 2>(*problem, share); break;
       case 33: step_rows<3, 3>(*problem, share); break;
       case 34: step_rows<3, 4>(*problem, share); break;
       case 35: step_rows<3, 5>(*problem, share); break;
+      case 36: step_rows<3, 6>(*problem, share); break;
     }
     return DONE;
   } catch (const std::exception &) {  // bad_alloc or length_error

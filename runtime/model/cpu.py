@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
-from ctypes import byref, c_void_p
+from ctypes import byref, c_int32, c_void_p
 from functools import lru_cache
 from typing import Any
 
@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from runtime.kernels import MARGIN, MAX_SETS, KernelImage, Panel, Problem, library, with_margin
 from runtime.model.buffers import LayerBuffer
 from runtime.model.contract import Step
-from runtime.model.geometry import Geometry, inverse
+from runtime.model.geometry import Geometry, RaySets, inverse
 from runtime.model.job import Job
 from runtime.model.targets import outside_codes, rest_of, target_table, without_alpha
 from runtime.optics.stack import PanelStack
-from runtime.records import F64, I16
+from runtime.records import I16
 from runtime.support.threads import on_rows, parallel_map
 
 WEIGHT, TAPER = 8191, 32767  # the number 1 in fixed point, in the targets' weights and in the tapers
@@ -61,6 +61,8 @@ class CpuState:
 
     def set_panel(self, panel: int, codes: I16) -> None:
         box, channels = self._geometry.boxes[panel], self._channels
+        if self._stack.is_grey(panel) and channels == 3:
+            codes = np.repeat(codes.mean(axis=2, keepdims=True).astype(np.int16), 3, axis=2)
         self._held.last[panel, : box.height_px, : box.width_px * channels] = codes.reshape(box.height_px, -1)
         self._resting.discard(panel)
 
@@ -68,7 +70,7 @@ class CpuState:
         self._resting.discard(self._geometry.middle)  # every pixel is written below
         self._rest_others()
         held = self._held
-        problem, _keep = self._problem(self._geometry.panels_from_rays("middle", 0.0), ahead=held.ahead, last=held.last)
+        problem, _keep = self._problem(self._geometry.closing_sets(), ahead=held.ahead, last=held.last)
         self._in_parts(library().close_middle, problem)
 
     def start(self) -> None:
@@ -80,8 +82,8 @@ class CpuState:
         # Rays may still read a row after it has been updated. The first step reads `last`, so it writes to other
         # memory.
         ahead, last = (held.last, held.ahead) if self._starts else (held.ahead, held.last)
-        panels_from_rays = self._geometry.panels_from_rays(step.places, self._sigma_m)
-        problem, _keep = self._problem(panels_from_rays, ahead=ahead, last=last)
+        sets = self._geometry.ray_sets(step.places, self._sigma_m)
+        problem, _keep = self._problem(sets, ahead=ahead, last=last)
         problem.size, problem.momentum, problem.floor = step.size, step.momentum, step.floor
         self._in_parts(library().step, problem)
         held.last, held.ahead, held.moved, self._starts = last, held.moved, ahead, False
@@ -122,22 +124,24 @@ class CpuState:
     def _in_parts(self, work: Any, problem: Problem) -> None:
         parallel_map(lambda part: work(byref(problem), part, self._threads), range(self._threads))
 
-    def _problem(self, panels_from_rays: F64, *, ahead: I16, last: I16) -> tuple[Problem, object]:
+    def _problem(self, sets: RaySets, *, ahead: I16, last: I16) -> tuple[Problem, object]:
         """Return the arguments for the compiled loops, and the arrays to keep alive during the call."""
         geometry, held, channels = self._geometry, self._held, self._channels
-        seen, back = np.ascontiguousarray(panels_from_rays), np.ascontiguousarray(inverse(panels_from_rays))
+        seen, back = (np.ascontiguousarray(x) for x in (sets.panels_from_rays, inverse(sets.panels_from_rays)))
         if len(seen) > MAX_SETS:
             raise ValueError(f"there are {len(seen)} sets of rays, but the kernels accept at most {MAX_SETS}")
         table = _packed_table(self._stack.count)
         problem = Problem(
             panels=self._stack.count, sets=len(seen), channels=channels,
-            height=geometry.rays.height_px // (len(seen) // 2), width=geometry.rays.width_px,
+            height=geometry.rays.height_px // sets.turns, width=geometry.rays.width_px,
+            turns=sets.turns, turn=(c_int32 * MAX_SETS)(*sets.turn),
             panels_from_rays=seen.ctypes.data, rays_from_panels=back.ctypes.data,
-            targets=(c_void_p * 2)(*(target.ctypes.data for target in self._targets)),
+            targets=(c_void_p * MAX_SETS)(*(self._targets[view].ctypes.data for view in sets.views)),
             column_taper=self._tapers[0].ctypes.data, row_taper=self._tapers[1].ctypes.data,
             table=table.ctypes.data, rest=self._rest, missing=geometry.missing_weight,
         )  # fmt: skip
         for n, box in enumerate(geometry.boxes):
+            problem.grey[n] = self._stack.is_grey(n)
             images = ahead[n], held.moved[n], held.last[n], last[n]
             problem.panel[n] = Panel(
                 *(KernelImage.of(image, rows=box.height_px, width=box.width_px) for image in images)

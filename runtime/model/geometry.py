@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import ceil, floor
+from typing import NamedTuple
 
 import numpy as np
 
@@ -56,6 +57,19 @@ class TargetView:
         return self.picture.pixels() if isinstance(self.picture, DrawnPicture) else self.picture
 
 
+class RaySets(NamedTuple):
+    """The ray sets of one step.
+
+    Sets take turns from one picture row to the next: row k of the rays of a set with turn t is picture row
+    `turns`·k + t.
+    """
+
+    panels_from_rays: F64  # (E, N, 3, 3) homographies from a set's rays to pixels in the panels' boxes
+    views: tuple[int, ...]  # (E,) each set's view
+    turn: tuple[int, ...]  # (E,)
+    turns: int
+
+
 @dataclass(frozen=True)
 class Geometry:
     """The pixels that one solution computes, and the rays it considers."""
@@ -67,6 +81,7 @@ class Geometry:
     rays: PixelRect  # picture pixels whose rays pass through `kept`
     middle_from_rays: F64  # (V, 3, 3) for each eye, from pixels in `rays` to pixels in the middle panel's box
     taper_px: tuple[float, float] = (0.0, 0.0)  # width of a window's taper, right and down, in middle-panel pixels
+    points: int = 1  # points of each pupil that have views of their own; the views of each point in turn
 
     @property
     def middle(self) -> int:
@@ -83,8 +98,8 @@ class Geometry:
     def is_like(self, other: Geometry) -> bool:
         """Return True if the rays and boxes are equal, so that steps may continue from the other solution."""
         return (
-            (self.stack, self.boxes, self.kept, self.rays, self.taper_px)
-            == (other.stack, other.boxes, other.kept, other.rays, other.taper_px)
+            (self.stack, self.boxes, self.kept, self.rays, self.taper_px, self.points)
+            == (other.stack, other.boxes, other.kept, other.rays, other.taper_px, other.points)
             and np.array_equal(self.eyes_m, other.eyes_m)
             and np.array_equal(self.middle_from_rays, other.middle_from_rays)
         )
@@ -94,37 +109,52 @@ class Geometry:
         """The panels' pixel grids, cropped to their boxes."""
         return tuple(box.cut(self.stack.panel(n)) for n, box in enumerate(self.boxes))
 
-    def panels_from_rays(self, places: Places, eye_sigma_m: float) -> F64:
-        """Return one step's homographies from rays to pixels in the panels' boxes.
+    def ray_sets(self, places: Places, eye_sigma_m: float) -> RaySets:
+        """Return one step's ray sets: every view at 1 or 2 head positions, which take turns.
 
-        A step assumes P = 1 or 2 head positions, which alternate from one picture row to the next. Row k of the rays
-        for position p is picture row P·k + p.
+        If the views belong to several points of each pupil, these take turns too, so that a step costs the same.
 
         Args:
             places: Head positions assumed by the step.
             eye_sigma_m: Standard deviation of the tracking error. It is limited so that all assumed eyes are in front
                 of the panels.
-
-        Returns:
-            (P·V, N, 3, 3) homographies. The first axis lists all eyes for each head position in turn.
         """
-        right, up = stack_from_eye(self.eyes_m.mean(axis=0))[:3, 0], np.array([0.0, 0.0, 1.0])
         eye_sigma_m = self._possible_m(eye_sigma_m)
         sure = self.rays.height_px == 1 or self._moved_px(eye_sigma_m) < KNOWN_PX
         positions = PLACES["middle" if sure else places]
-        turns, homographies = len(positions), []
+        if self.points == 1:
+            turns = [range(len(self.eyes_m))] * len(positions)
+        else:
+            each, first = len(self.eyes_m) // self.points, int(places == "falling")
+            turns = [range(p * each, (p + 1) * each) for p in np.roll(range(self.points), first).tolist()]
+        return self._sets(turns, eye_sigma_m * np.array([positions[n % len(positions)] for n in range(len(turns))]))
+
+    def closing_sets(self) -> RaySets:
+        """Return the ray sets for closing the middle panel: every view's rays, without tracking error."""
+        return self._sets([range(len(self.eyes_m))], np.zeros((1, 2)))
+
+    def _sets(self, shown: Sequence[range], moved_m: F64) -> RaySets:
+        """Return ray sets.
+
+        Args:
+            shown: For each turn, its views.
+            moved_m: For each turn, the distance (right, up) between the assumed and the tracked head position.
+        """
+        right, up = stack_from_eye(self.eyes_m.mean(axis=0))[:3, 0], np.array([0.0, 0.0, 1.0])
+        turns, homographies = len(shown), []
         centre = np.array([self.rays.width_px / 2, self.rays.height_px / turns / 2, 1.0])
-        for turn, (across, down) in enumerate(positions):
+        for turn, (views, (across_m, up_m)) in enumerate(zip(shown, moved_m, strict=True)):
             rows = np.array([[1.0, 0.0, 0.0], [0.0, turns, turn + (1 - turns) / 2], [0.0, 0.0, 1.0]])
-            moved_m = eye_sigma_m * (across * right + down * up)
-            for eye_m, from_rays in zip(self.eyes_m + moved_m, self.middle_from_rays, strict=True):
+            for view in views:
+                eye_m, from_rays = self.eyes_m[view] + across_m * right + up_m * up, self.middle_from_rays[view]
                 between = [
                     panel_from_middle(self.stack, self.rasters, eye_m, n) if n != self.middle else np.eye(3)
                     for n in range(self.stack.count)
                 ]
                 seen = np.stack(between) @ from_rays @ rows
                 homographies.append(seen / (seen[:, 2] @ centre)[:, None, None])
-        return np.array(homographies)
+        turn_of = tuple(turn for turn, views in enumerate(shown) for _ in views)
+        return RaySets(np.array(homographies), tuple(view for views in shown for view in views), turn_of, turns)
 
     def _possible_m(self, eye_sigma_m: float) -> float:
         """Return a standard deviation limited to what a person's head and the panels leave room for."""
@@ -167,6 +197,7 @@ def geometry_of(
     boxes: tuple[PixelRect, ...],
     kept: PixelRect | None = None,
     taper_px: tuple[float, float] = (0.0, 0.0),
+    points: int = 1,
 ) -> Geometry:
     """Return the geometry for those rays of all views that pass through a part of the middle panel.
 
@@ -176,6 +207,7 @@ def geometry_of(
         boxes: Pixels to solve on each panel.
         kept: Part of the middle panel that the rays pass through. By default, the middle panel's box.
         taper_px: Width of a window's taper, right and down, in middle-panel pixels.
+        points: Points of each pupil that have views of their own.
     """
     box = boxes[stack.count // 2]
     kept = kept or box
@@ -185,7 +217,7 @@ def geometry_of(
     first = np.array([[1.0, 0.0, rays.u0], [0.0, 1.0, rays.v0], [0.0, 0.0, 1.0]])
     to_box = np.array([[1.0, 0.0, -box.u0], [0.0, 1.0, -box.v0], [0.0, 0.0, 1.0]])
     middle_from_rays = np.stack([to_box @ matrix @ first for matrix in middle_from_pictures])
-    return Geometry(stack, eyes_m, boxes, kept, rays, middle_from_rays, taper_px)
+    return Geometry(stack, eyes_m, boxes, kept, rays, middle_from_rays, taper_px, points)
 
 
 def _snapped(homography: F64) -> F64:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -44,22 +45,27 @@ class Targets:
     # (V, 3) eye positions, frame `stack`: the first viewer's left and right eye, then the next viewer's
     eyes_m: F64
     views: tuple[TargetView, ...]  # what each of these eyes should see
+    # Points of each pupil that have views of their own; `eyes_m` and `views` list all eyes for each point in turn
+    points: int = 1
 
     @cached_property
     def visible(self) -> Geometry:
         """Geometry for all rays that cross every panel."""
-        return geometry_of(self.stack, self.eyes_m, self.views, boxes=visible_boxes(self.eyes_m, self.stack))
+        return self._geometry(visible_boxes(self.eyes_m, self.stack))
 
     @cached_property
     def every_pixel(self) -> Geometry:
         """Geometry for solving every pixel on every panel, including those that the eyes do not see."""
         whole = PixelRect(0, 0, self.stack.width_px, self.stack.height_px)
-        return geometry_of(self.stack, self.eyes_m, self.views, boxes=(whole,) * self.stack.count)
+        return self._geometry((whole,) * self.stack.count)
 
     def within(self, window: SolveWindow) -> Geometry:
         """Return the geometry for solving the pixels in a window."""
         boxes = (window.box,) * self.stack.count
-        return geometry_of(self.stack, self.eyes_m, self.views, boxes=boxes, kept=window.kept, taper_px=window.taper_px)
+        return self._geometry(boxes, kept=window.kept, taper_px=window.taper_px)
+
+    def _geometry(self, boxes: tuple[PixelRect, ...], **how: Any) -> Geometry:
+        return geometry_of(self.stack, self.eyes_m, self.views, boxes=boxes, points=self.points, **how)
 
     def reduced(self, reduction: int) -> tuple[TargetView, ...]:
         """Return the views averaged down by `reduction` (`reduced_view`). Cached."""

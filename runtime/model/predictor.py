@@ -9,7 +9,6 @@ from runtime.config import ModelSettings
 from runtime.errors import InputError, MissingPart
 from runtime.kernels import MAX_PANELS, library
 from runtime.model.base import Prediction, Predictor
-from runtime.model.contract import Places, Step
 from runtime.optics.stack import PanelStack
 from runtime.support.memory import keep_freed_memory
 
@@ -49,17 +48,6 @@ def shipped_sha256(name: str) -> str:
         raise InputError(table, f"{name}.onnx", "is not listed; reinstall phasestack") from None
 
 
-def steps_from_even(steps: int) -> tuple[Step, ...]:
-    """Return the steps to run without a network, starting from panels at the rest value.
-
-    Args:
-        steps: Number of steps that the model runs when it can start from its network's proposal.
-    """
-    in_turn: tuple[Places, ...] = ("rising", "middle", "falling", "middle")
-    sizes = (1.2,) * (4 * steps) + (0.8,) * (3 * steps // 2)
-    return tuple(Step(size=size, places=in_turn[n % 4]) for n, size in enumerate(sizes))
-
-
 def load_predictor(name: str, stack: PanelStack, settings: ModelSettings | None = None) -> Predictor:
     """Load a model for a stack.
 
@@ -87,7 +75,7 @@ def load_predictor(name: str, stack: PanelStack, settings: ModelSettings | None 
     from runtime.model.network import PictureProposal
     from runtime.model.proposal import INPUTS, ChainProposal
     from runtime.model.session import ModelSession
-    from runtime.model.solver import StepPredictor
+    from runtime.model.solver import StepPredictor, steps_from_even
 
     if stack.count > MAX_PANELS:
         raise InputError("model", "name", f"{name} supports at most {MAX_PANELS} panels; use the model sart")

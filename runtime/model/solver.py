@@ -7,19 +7,17 @@ The algorithm is described in docs/mathematics.md. This module calls the operati
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from time import perf_counter_ns
 
 from runtime.clock import Stopwatch
 from runtime.model.base import STAGES, Prediction, Predictor
 from runtime.model.buffers import LayerBuffer, LayerPool
-from runtime.model.contract import Step
+from runtime.model.contract import Places, Step
 from runtime.model.cpu import CpuBackend
 from runtime.model.device import SolverBackend, SolverState
 from runtime.model.geometry import Geometry
 from runtime.model.job import Job
 from runtime.model.proposal import Proposal
-from runtime.model.sart import SartPredictor
 from runtime.optics.malus import rest_code
 from runtime.optics.stack import PanelStack
 
@@ -27,6 +25,17 @@ _Done = tuple[int, int | None]  # number of steps, and how many of them earlier 
 REDUCTIONS = (1, 2, 3, 4)  # supported rasters, given as divisors of the display's rows and columns
 REFINED_STEPS = 8  # a solution is continued for up to this many steps in total, as many as `best` has
 REFINING = (Step(size=0.8, places="falling"), Step(size=0.8, places="rising"))  # alternate after the model's steps
+
+
+def steps_from_even(steps: int) -> tuple[Step, ...]:
+    """Return the steps to run without a network, starting from panels at the rest value.
+
+    Args:
+        steps: Number of steps that the model runs when it can start from its network's proposal.
+    """
+    in_turn: tuple[Places, ...] = ("rising", "middle", "falling", "middle")
+    sizes = (1.2,) * (4 * steps) + (0.8,) * (3 * steps // 2)
+    return tuple(Step(size=size, places=in_turn[n % 4]) for n, size in enumerate(sizes))
 
 
 class StepPredictor(Predictor):
@@ -52,6 +61,7 @@ class StepPredictor(Predictor):
             backend: Device that runs everything except the network. By default, the processor.
         """
         self.stack, self.name, self._proposal, self._steps = stack, name, proposal, tuple(steps)
+        self._steps_from_even = self._steps if proposal is None else steps_from_even(len(self._steps))
         self.provider, self.parameters, self._threads = "cpu", 0, threads
         if proposal is not None:
             contract = proposal.session.contract
@@ -75,10 +85,12 @@ class StepPredictor(Predictor):
         return context is not None and self._backend.context is context
 
     def name_with(self, views: int) -> str:
-        return self.name if views == 2 and not self.stack.colour else f"sart (in place of {self.name})"
+        return (
+            self.name if views == 2 or self._proposal is None else f"{self.name} (without its network: needs two views)"
+        )
 
     def on_panels(self, stack: PanelStack) -> StepPredictor | None:
-        if not self.any_raster or stack.count != 3:
+        if not self.any_raster:
             return None
         return StepPredictor(stack, self._proposal, self._steps, name=self.name, threads=self._threads)
 
@@ -88,8 +100,6 @@ class StepPredictor(Predictor):
 
     def solve(self, job: Job, watch: Stopwatch | None = None) -> Prediction:
         watch = watch or Stopwatch(*STAGES)
-        if len(job.views) != 2 or job.stack.colour:  # the kernels solve two views on panels with colour filters
-            return SartPredictor(job.stack).solve(replace(job, window=None, channels=3), watch)
         if job.stack not in self._rasters:
             state = self._backend.state(job.stack, threads=self._threads)
             self._rasters[job.stack] = state, LayerPool(job.stack)
@@ -135,18 +145,25 @@ class StepPredictor(Predictor):
             if not resumed:
                 self._propose(job, geometry, state, watch)
             watch.lap("finish")
-            while done < (self.steps if job.steps is None else job.steps):
+            steps = self._steps if self._is_proposed(job) else self._steps_from_even
+            while done < (len(steps) if job.steps is None else job.steps):
                 if job.deadline_ns is not None and perf_counter_ns() >= job.deadline_ns:
                     break
-                state.step(self._steps[done] if done < self.steps else REFINING[(done - self.steps) % len(REFINING)])
+                state.step(steps[done] if done < len(steps) else REFINING[(done - len(steps)) % len(REFINING)])
                 done += 1
             watch.lap("step")
             state.write(buffer, outside)
         self._improved = geometry, job.channels, done
         return done, first
 
+    def _is_proposed(self, job: Job) -> bool:
+        """Return True if the network proposes panels for a job, which must have one view for each of two eyes."""
+        return self._proposal is not None and len(job.views) == 2 * job.targets.points
+
     def _propose(self, job: Job, geometry: Geometry, state: SolverState, watch: Stopwatch) -> None:
-        proposed = {} if self._proposal is None else self._proposal.panels(job, geometry, watch)
+        proposed = {}
+        if self._proposal is not None and self._is_proposed(job):
+            proposed = self._proposal.panels(job, geometry, watch)
         for n, codes in proposed.items():
             state.set_panel(n, codes)
         if geometry.middle not in proposed:

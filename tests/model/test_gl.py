@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -79,7 +79,7 @@ def cards(pair: F64, stack: PanelStack, *, grey: bool = False) -> tuple[U8, U8]:
 
 def layers_of(
     predictor: Predictor,
-    pictures: tuple[U8, U8],
+    pictures: Sequence[U8],
     pair: F64,
     *,
     sigma_mm: float = 1.0,
@@ -111,6 +111,29 @@ def test_codes_are_the_processors(name: str, pose: str, sigma_mm: float, gl: GlB
     wanted, found = (layers_of(p, pictures, pair, sigma_mm=sigma_mm) for p in both(name, STACK, gl))
     assert within_one(wanted, found) >= WITHIN_ONE
     assert (found[..., 3] == 255).all()
+
+
+MORE_STACKS = {
+    "two": replace(STACK, x_m=(-0.03, 0.03)),
+    "four": replace(STACK, x_m=(-0.09, -0.03, 0.03, 0.09)),
+    "six, uneven": replace(STACK, x_m=(-0.06, -0.04, -0.01, 0.01, 0.03, 0.06)),
+    "front without filters": replace(STACK, colour=(True, True, False)),
+    "middle without filters": replace(STACK, colour=(True, False, True)),
+}
+
+
+@pytest.mark.parametrize("views", [2, 4, 8])
+@pytest.mark.parametrize("stack", MORE_STACKS)
+def test_codes_of_any_panels_for_any_number_of_views(stack: str, views: int, gl: GlBackend) -> None:
+    at = np.concatenate([eyes(0.6, side_m) for side_m in (-0.15, 0.15, 0.0, 0.25)])[:views]
+    pictures = [card_scene(eye, width_px=240, height_px=135) for eye in at]
+    wanted, found = (
+        layers_of(p, pictures, at, sigma_mm=UNSURE_MM, changed=lambda job: replace(job, steps=4))
+        for p in both("balanced", MORE_STACKS[stack], gl)
+    )
+    assert within_one(wanted, found) >= WITHIN_ONE
+    for n in range(len(found)):
+        assert not MORE_STACKS[stack].is_grey(n) or (np.ptp(found[n, ..., :3], axis=-1) == 0).all()
 
 
 @pytest.mark.parametrize("gap_m", [0.01, 0.03, 0.2])

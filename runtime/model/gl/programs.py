@@ -16,6 +16,7 @@ from runtime.kernels import EDGE_CLAMP_PX, FULL
 from runtime.support.background import raise_if_abandoned
 
 INCLUDE = re.compile(r'^#include "([a-z_]+\.glsl)"$', re.MULTILINE)
+REPEATED = re.compile(r"^#for ([A-Z]+)\n(.*?)^#end\n", re.MULTILINE | re.DOTALL)
 SHADERS = "runtime.model.gl"
 CONSTANTS = f"FULL {FULL:.1f}", f"EDGE_CLAMP_PX {EDGE_CLAMP_PX:.1f}"
 
@@ -33,19 +34,29 @@ class Image:
         return self.width_px, self.height_px
 
 
-def source(name: str, *, defines: Sequence[str] = ()) -> str:
+def source(name: str, counts: Sequence[tuple[str, int]] = ()) -> str:
     """Return a shader's source code with its included files inserted.
+
+    Lines between `#for NAME` and `#end` are repeated, with `@` replaced by 0, 1 and so on, because a shader cannot
+    choose an image by a number.
 
     Args:
         name: The shader's file name.
-        defines: Names to define for the shader's `#ifdef` lines.
+        counts: How often to repeat the lines of each name.
     """
 
     def read(file: str) -> str:
         return (resources.files(SHADERS) / "shaders" / file).read_text(encoding="ascii")
 
-    first, _, rest = INCLUDE.sub(lambda found: read(found[1]), read(name)).partition("\n")
-    return "\n".join((first, *(f"#define {one}" for one in (*CONSTANTS, *defines)), rest))
+    def repeated(found: re.Match[str]) -> str:
+        return "".join(found[2].replace("@", str(n)) for n in range(dict(counts)[found[1]]))
+
+    text = REPEATED.sub(repeated, INCLUDE.sub(lambda found: read(found[1]), read(name)))
+    first, _, rest = text.partition("\n")
+    return "\n".join((first, *(f"#define {one}" for one in CONSTANTS), rest))
+
+
+Counts = tuple[tuple[str, int], ...]
 
 
 class Passes:
@@ -54,7 +65,7 @@ class Passes:
     def __init__(self, context: moderngl.Context) -> None:
         self.context = context
         self._vertex = source("whole.vert.glsl")
-        self._programs: dict[tuple[str, tuple[str, ...]], tuple[Any, Any, dict[str, Any]]] = {}
+        self._programs: dict[tuple[str, Counts], tuple[Any, Any, dict[str, Any]]] = {}
         self._targets: dict[tuple[int, ...], Any] = {}
 
     @contextmanager
@@ -78,7 +89,7 @@ class Passes:
         inputs: Mapping[str, Image],
         uniforms: Mapping[str, Any],
         *,
-        defines: tuple[str, ...] = (),
+        counts: Counts = (),
         at: tuple[int, int, int, int] | None = None,
     ) -> None:
         """Run a shader for every output pixel.
@@ -88,11 +99,11 @@ class Passes:
             outputs: Images to write to.
             inputs: Images, keyed by their names in the shader. Images that the shader does not use are ignored.
             uniforms: Other uniforms, keyed by their names in the shader. Unused ones are ignored.
-            defines: Names to define for the shader's `#ifdef` lines.
+            counts: How often to repeat the shader's repeated lines (`source`).
             at: First column, first row, width and height of the area to draw. By default, all of the first output.
         """
         raise_if_abandoned()
-        program, array, held = self._program(name, defines)
+        program, array, held = self._program(name, counts)
         for unit, (key, image) in enumerate(inputs.items()):
             image.texture.use(unit)
             self._set(program, held, key, unit)
@@ -129,12 +140,12 @@ class Passes:
             program.release()
         self._targets, self._programs = {}, {}
 
-    def _program(self, name: str, defines: tuple[str, ...]) -> tuple[Any, Any, dict[str, Any]]:
-        if (name, defines) not in self._programs:
-            fragment = source(f"{name}.frag.glsl", defines=defines)
+    def _program(self, name: str, counts: Counts) -> tuple[Any, Any, dict[str, Any]]:
+        if (name, counts) not in self._programs:
+            fragment = source(f"{name}.frag.glsl", counts)
             program = self.context.program(vertex_shader=self._vertex, fragment_shader=fragment)
-            self._programs[name, defines] = program, self.context.vertex_array(program, []), {}
-        return self._programs[name, defines]
+            self._programs[name, counts] = program, self.context.vertex_array(program, []), {}
+        return self._programs[name, counts]
 
     @staticmethod
     def _set(program: Any, held: dict[str, Any], key: str, value: Any) -> None:

@@ -7,7 +7,7 @@ and one is unused, because drivers need not support drawing into textures with t
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any
 
@@ -19,15 +19,15 @@ from runtime.errors import InputError
 from runtime.kernels import FULL
 from runtime.model.buffers import LayerBuffer
 from runtime.model.contract import Step
-from runtime.model.geometry import Geometry, TargetView, inverse
-from runtime.model.gl.programs import Image, Passes
+from runtime.model.geometry import Geometry, RaySets, TargetView, inverse
+from runtime.model.gl.programs import Counts, Image, Passes
 from runtime.model.job import Job
 from runtime.model.targets import outside_codes, rest_of, target_table
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, I16
 from runtime.support.gl import DrawnPicture, finish
 
-PANELS, MIDDLE = 3, 1
+MOST_SETS = 6  # maximum number of ray sets that a shader reads; every driver allows 16 images
 
 
 class GlBackend:
@@ -55,7 +55,7 @@ class GlBackend:
 
 
 class GlState:
-    """`SolverState` for three panels. A state may be used only by the OpenGL context's thread."""
+    """`SolverState` for OpenGL. A state may be used only by the OpenGL context's thread."""
 
     def __init__(self, passes: Passes, stack: PanelStack) -> None:
         """Create the state. Raises InputError if a panel is too large for the driver.
@@ -63,7 +63,7 @@ class GlState:
         Several states may share `passes`.
         """
         check_size(passes.context, stack)
-        self._passes, self._stack = passes, stack
+        self._passes, self._stack, self._count = passes, stack, stack.count
         self._textures: dict[tuple[Any, ...], Any] = {}
         self._names: dict[str, str] = {}  # which image currently has each role, for pairs of images that are swapped
         self._closed = False
@@ -75,13 +75,15 @@ class GlState:
             self._targets = [self._loaded(view, side) for side, view in enumerate(job.views)]
             for name, taper in zip(("column_taper", "row_taper"), geometry.tapers(), strict=True):
                 self._texture(name, (self._longest, 1), 1, dtype="f4").write(taper, viewport=(0, 0, len(taper), 1))
-            rest = (rest_of(PANELS) / FULL + 1) / 3
-            for n in range(0 if resumed else PANELS):
+            rest = (rest_of(self._count) / FULL + 1) / 3
+            for n in range(0 if resumed else self._count):
                 self._passes.target((self._panel("last", n),)).clear(rest, rest, rest, rest)
             yield
 
     def set_panel(self, panel: int, codes: I16) -> None:
         box = self._geometry.boxes[panel]
+        if self._stack.is_grey(panel) and codes.ndim == 3:
+            codes = np.repeat(codes.mean(axis=2, keepdims=True).astype(np.int16), 3, axis=2)
         unit = 65535 / (3 * FULL)
         stored = np.asarray(cv2.addWeighted(codes, unit, codes, 0.0, FULL * unit, dtype=cv2.CV_16U))
         if stored.ndim == 3:
@@ -89,56 +91,84 @@ class GlState:
         self._panel("last", panel).texture.write(stored, viewport=(0, 0, box.width_px, box.height_px), alignment=1)
 
     def close_middle(self) -> None:
-        seen = self._geometry.panels_from_rays("middle", 0.0)
-        back = inverse(seen)
-        table = self._texture("table", (256, 1), 2, dtype="f4", data=target_table(PANELS))
-        inputs = {"last0": self._panel("last", 0), "last2": self._panel("last", 2), "table": Image(table, 256, 1)}
-        gathered: dict[str, Image] = {"last": self._panel("last", MIDDLE)}
-        for side in (0, 1):
-            weight, residual = (self._rays(f"{name}{side}") for name in ("weight", "residual"))
-            weights = {"rest": 0.5, "missing": self._geometry.missing_weight}
-            targets = {"targets": self._targets[side][0]}
-            uniforms = {**self._through(seen[side], side), **weights}
-            self._passes.draw("residual", (weight, residual), {**inputs, **targets}, uniforms)
-            gathered |= {f"weight{side}": weight, f"residual{side}": residual}
-        self._passes.draw("fill", (self._panel("spare", MIDDLE),), gathered, self._back(back[:, MIDDLE]))
-        self._swap("last", "spare", MIDDLE)
+        sets, middle = self._geometry.closing_sets(), self._geometry.middle
+        table = self._texture("table", (256, 1), 2, dtype="f4", data=target_table(self._count))
+        inputs = {f"last{n}": self._panel("last", n) for n in range(self._count)} | {"table": Image(table, 256, 1)}
+        weights = {"rest": 0.5, "missing": self._geometry.missing_weight, "middle": middle}
+        fields: list[tuple[Image, Image]] = []
+        for number, (view, matrices) in enumerate(zip(sets.views, sets.panels_from_rays, strict=True)):
+            weight, residual = self._rays(f"curvature {number}"), self._rays(f"gradient {number}")
+            targets = {"targets": self._targets[view][0]}
+            uniforms = {**self._through(matrices, view), **weights}
+            counts = (("PANELS", self._count),)
+            self._passes.draw("residual", (weight, residual), {**inputs, **targets}, uniforms, counts=counts)
+            fields.append((weight, residual))
+        gathered, uniforms, counts = self._gathered(fields, sets, middle)
+        last = {"last": self._panel("last", middle)}
+        self._passes.draw("fill", (self._panel("spare", middle),), {**last, **gathered}, uniforms, counts=counts)
+        self._swap("last", "spare", middle)
 
     def start(self) -> None:
         self._ahead = "last"  # there is no momentum yet, so the first step reads the panels themselves
 
     def step(self, step: Step) -> None:
-        seen = self._geometry.panels_from_rays(step.places, self._sigma_m)
-        back, places = inverse(seen), len(seen) // 2
-        ahead = {f"ahead{n}": self._panel(self._ahead, n) for n in range(PANELS)}
+        sets = self._geometry.ray_sets(step.places, self._sigma_m)
+        ahead = {f"ahead{n}": self._panel(self._ahead, n) for n in range(self._count)}
         tapers = {name: self._taper(name) for name in ("column_taper", "row_taper")}
-        fields: dict[str, Image] = {}
-        for number, matrices in enumerate(seen):
-            drawn = {f"{name}{number}": self._rays(f"{name} {number}", places) for name in ("curvature", "gradient")}
-            inputs = {**ahead, "targets": self._targets[number % 2][0], **tapers}
-            uniforms = {**self._through(matrices, number % 2), "turn": (places, number // 2)}
-            self._passes.draw("compare", tuple(drawn.values()), inputs, uniforms)
-            fields |= drawn
-        update = {
-            "size": step.size / (PANELS * np.pi / 2), "momentum": step.momentum, "least": step.floor * len(seen),
-        }  # fmt: skip
-        for n in range(PANELS):
-            inputs = {"ahead": ahead[f"ahead{n}"], "last": self._panel("last", n), **fields}
+        fields: list[tuple[Image, Image]] = []
+        for number, (view, turn, matrices) in enumerate(zip(sets.views, sets.turn, sets.panels_from_rays, strict=True)):
+            drawn = self._rays(f"curvature {number}", sets.turns), self._rays(f"gradient {number}", sets.turns)
+            inputs = {**ahead, "targets": self._targets[view][0], **tapers}
+            uniforms = {**self._through(matrices, view), "turn": (sets.turns, turn)}
+            self._passes.draw("compare", drawn, inputs, uniforms, counts=(("PANELS", self._count),))
+            fields.append(drawn)
+        for n in range(self._count):
+            gathered, uniforms, counts = self._gathered(fields, sets, n)
+            # Collected sums are divided by the number of sets. This changes the step only through the floor.
+            share = 1.0 if len(fields) <= MOST_SETS else 1.0 / len(fields)
+            update = {
+                "size": step.size / (self._count * np.pi / 2), "momentum": step.momentum,
+                "least": step.floor * len(fields) * share,
+            }  # fmt: skip
+            inputs = {"ahead": ahead[f"ahead{n}"], "last": self._panel("last", n), **gathered}
             outputs = self._panel("moved", n), self._panel("spare", n)
-            defines = {1: (), 2: ("FOUR_SETS",)}[places]
-            self._passes.draw("move", outputs, inputs, {**self._back(back[:, n], places), **update}, defines=defines)
+            self._passes.draw("move", outputs, inputs, {**uniforms, **update}, counts=counts)
             self._swap("ahead", "moved", n)
             self._swap("last", "spare", n)
         self._ahead = "ahead"
 
+    def _gathered(
+        self, fields: Sequence[tuple[Image, Image]], sets: RaySets, n: int
+    ) -> tuple[dict[str, Image], dict[str, Any], Counts]:
+        """Return the inputs, uniforms and counts with which a shader sums the ray sets' quantities at panel `n`.
+
+        If there are more sets than a shader can read, they are first collected in groups.
+        """
+        back = inverse(sets.panels_from_rays)[:, n]
+        rays: tuple[int, int] = fields[0][0].size
+        grey = self._stack.is_grey(n) and self._channels > 1
+        if len(fields) > MOST_SETS:
+            groups, box = range(0, len(fields), MOST_SETS), self._panel("last", n).size
+            collected = []
+            for group in groups:
+                part = slice(group, group + MOST_SETS)
+                inputs, uniforms, counts = _summed(fields[part], back[part], rays, grey=False)
+                means = self._panel(f"first {group}", n), self._panel(f"second {group}", n)
+                self._passes.draw("collect", means, inputs, {**uniforms, "total": float(len(fields))}, counts=counts)
+                collected.append(means)
+            fields, back, rays = collected, np.repeat(np.eye(3)[None], len(groups), axis=0), box
+        return _summed(fields, back, rays, grey=grey)
+
     def write(self, buffer: LayerBuffer, outside: int | tuple[int, ...] | None) -> None:
         width, height = self._stack.width_px, self._stack.height_px
-        layers = [self._texture(("layer", n), (width, height), 4, dtype="f1") for n in range(PANELS)]
+        layers = [self._texture(("layer", n), (width, height), 4, dtype="f1") for n in range(self._count)]
         for n, texture in enumerate(layers):
             image, box = Image(texture, width, height), self._geometry.boxes[n]
-            kept = self._geometry.kept if n == MIDDLE else box
+            kept = self._geometry.kept if n == self._geometry.middle else box
             if outside is not None:
-                self._passes.target((image,)).clear(*(code / 255 for code in outside_codes(PANELS, n, outside)), 1.0)
+                self._passes.target((image,)).clear(
+                    *(code / 255 for code in outside_codes(self._count, n, outside)), 1.0
+                )
             if kept.width_px and kept.height_px:
                 place = {"first": (kept.u0 - box.u0, kept.v0 - box.v0), "grey": self._channels == 1}
                 inputs = {"last": self._panel("last", n)}
@@ -156,7 +186,7 @@ class GlState:
             self._textures = {}
 
     def _loaded(self, view: TargetView, side: int) -> tuple[Image, tuple[int, int]]:
-        """Return the image with an eye's target picture, and the (column, row) of the first ray in it.
+        """Return the image with a view's target picture, and the (column, row) of the first ray in it.
 
         If the picture is an array, it is uploaded to a texture.
         """
@@ -175,10 +205,6 @@ class GlState:
         for n, (matrix, box) in enumerate(zip(matrices, self._geometry.boxes, strict=True)):
             uniforms |= {f"from_rays{n}": _mat3(matrix), f"size{n}": (box.width_px, box.height_px)}
         return uniforms
-
-    def _back(self, matrices: F64, places: int = 1) -> dict[str, Any]:
-        rays = self._geometry.rays.width_px, self._geometry.rays.height_px // places
-        return {"rays": rays, **{f"rays_from{number}": _mat3(matrix) for number, matrix in enumerate(matrices)}}
 
     @property
     def _components(self) -> int:
@@ -199,10 +225,10 @@ class GlState:
         a, b = f"{one} {n}", f"{other} {n}"
         self._names[a], self._names[b] = self._names.get(b, other), self._names.get(a, one)
 
-    def _rays(self, name: str, places: int = 1) -> Image:
+    def _rays(self, name: str, turns: int = 1) -> Image:
         """Return the image that holds one quantity for all rays in a set."""
         image = self._ray_image(name, self._components, "nu2")
-        return Image(image.texture, image.width_px, image.height_px // places)
+        return Image(image.texture, image.width_px, image.height_px // turns)
 
     def _taper(self, name: str) -> Image:
         return Image(self._texture(name, (self._longest, 1), 1, dtype="f4"), self._longest, 1)
@@ -236,6 +262,16 @@ def check_size(context: moderngl.Context, stack: PanelStack) -> None:
             raise InputError(
                 "stack", name, f'is {value}, but this OpenGL driver allows at most {limit}; set model.backend = "cpu"'
             )
+
+
+def _summed(
+    fields: Sequence[tuple[Image, Image]], back: F64, rays: tuple[int, int], *, grey: bool
+) -> tuple[dict[str, Image], dict[str, Any], Counts]:
+    inputs, uniforms = {}, {"rays": rays, "grey": grey}
+    for number, ((first, second), matrix) in enumerate(zip(fields, back, strict=True)):
+        inputs |= {f"first{number}": first, f"second{number}": second}
+        uniforms[f"rays_from{number}"] = _mat3(matrix)
+    return inputs, uniforms, (("SETS", len(fields)),)
 
 
 def _mat3(matrix: F64) -> tuple[float, ...]:

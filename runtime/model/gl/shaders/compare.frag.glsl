@@ -2,10 +2,13 @@
 // Compute the squared slope, and the error times the slope, for one ray set (docs/mathematics.md, L1 to L4).
 uniform vec2 origin;
 #include "places.glsl"
-uniform sampler2D ahead0, ahead1, ahead2, targets, column_taper, row_taper;
-uniform mat3 from_rays0, from_rays1, from_rays2;
-uniform vec2 size0, size1, size2;
-// turn: number of head positions, which alternate from one picture row to the next, and index of this set's position
+uniform sampler2D targets, column_taper, row_taper;
+#for PANELS
+uniform sampler2D ahead@;
+uniform mat3 from_rays@;
+uniform vec2 size@;
+#end
+// turn: number of turns that sets take from one picture row to the next, and this set's turn
 uniform ivec2 targets_origin, turn;
 layout(location = 0) out vec4 curvature;
 layout(location = 1) out vec4 gradient;
@@ -25,19 +28,23 @@ void phasor(sampler2D ahead, vec2 at, vec2 size, out vec4 re, out vec4 im) {
 }
 
 void main() {
-    vec2 at0 = place(from_rays0), at1 = place(from_rays1), at2 = place(from_rays2);
     curvature = vec4(0.0);
     gradient = held_number(vec4(0.0));
-    if (!(inside(at0, size0, 0.5) && inside(at1, size1, 0.5) && inside(at2, size2, 0.5))) return;
-    vec4 a, b, p, q, g, h;
-    phasor(ahead0, at0, size0, a, b);
-    phasor(ahead1, at1, size1, p, q);
-    phasor(ahead2, at2, size2, g, h);
-    vec4 re = p * g - q * h, im = p * h + q * g, slope = a * im + b * re;
+#for PANELS
+    vec2 at@ = place(from_rays@);
+    if (!inside(at@, size@, 0.5)) return;
+#end
+    vec4 re = vec4(1.0), im = vec4(0.0), a, b, product;
+#for PANELS
+    phasor(ahead@, at@, size@, a, b);
+    product = re * a - im * b;
+    im = re * b + im * a;
+    re = product;
+#end
     ivec2 pixel = ivec2(gl_FragCoord.x, int(gl_FragCoord.y) * turn.x + turn.y);
     vec4 target = texelFetch(targets, pixel + targets_origin, 0);
     float taper = texelFetch(column_taper, ivec2(pixel.x, 0), 0).r * texelFetch(row_taper, ivec2(pixel.y, 0), 0).r;
-    vec4 error = (0.5 - 0.5 * (a * re - b * im) - target) * taper;
-    curvature = slope * slope;
-    gradient = held_number(error * slope);
+    vec4 error = (0.5 - 0.5 * re - target) * taper;
+    curvature = im * im;
+    gradient = held_number(error * im);
 }
