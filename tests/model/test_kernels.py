@@ -137,9 +137,9 @@ def test_an_uncertain_eye_stays_in_front_of_the_panels(sigma_m: float) -> None:
     near = np.array([[0.08, 0.065, 0.002], [0.08, 0.126, 0.015]])
     _, job, geometry = begun(STACK, near, own=False)
     for places in ("rising", "falling"):
-        weights = geometry.panels_from_rays(places, sigma_m)[:, :, 2] @ np.array([240.0, 60.0, 1.0])
+        weights = geometry.ray_sets(places, sigma_m).panels_from_rays[:, :, 2] @ np.array([240.0, 60.0, 1.0])
         np.testing.assert_allclose(weights, 1.0)
-        scales = geometry.panels_from_rays(places, sigma_m)[:, :, 0, 0]
+        scales = geometry.ray_sets(places, sigma_m).panels_from_rays[:, :, 0, 0]
         assert (scales > 0).all() and np.isfinite(scales).all()
     layers = load_predictor("sart" if sigma_m > 1 else "fast", STACK).solve(replace(job, eye_sigma_m=sigma_m)).layers
     assert layers.std() > 1
