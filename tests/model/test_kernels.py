@@ -159,9 +159,10 @@ def test_an_eye_between_the_panels_ends_no_process() -> None:
 def test_homographies_that_are_not_finite_are_refused(wrong: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """The compiler had removed the loops' guards, and NaN became row -2147483648."""
     state, _, geometry = begun(STACK, eyes(0.6), own=False)
-    matrices = geometry.panels_from_rays("middle", 0.0)
+    sets = geometry.ray_sets("middle", 0.0)
+    matrices = sets.panels_from_rays
     matrices[1, 2, 0, 1] = wrong
-    monkeypatch.setattr(type(geometry), "panels_from_rays", lambda *_: matrices)
+    monkeypatch.setattr(type(geometry), "ray_sets", lambda *_: sets)
     monkeypatch.setattr(cpu, "inverse", lambda _: np.nan_to_num(matrices))
     with pytest.raises(ValueError, match="homography"):
         state.step(Step(size=1.0, places="middle"))
