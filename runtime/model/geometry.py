@@ -81,7 +81,7 @@ class Geometry:
     rays: PixelRect  # picture pixels whose rays pass through `kept`
     middle_from_rays: F64  # (V, 3, 3) for each eye, from pixels in `rays` to pixels in the middle panel's box
     taper_px: tuple[float, float] = (0.0, 0.0)  # width of a window's taper, right and down, in middle-panel pixels
-    points: int = 1  # points of each pupil that have views of their own; the views of each point in turn
+    points: int = 1  # points of each pupil that have separate views; the views of each point in turn
 
     @property
     def middle(self) -> int:
@@ -207,7 +207,7 @@ def geometry_of(
         boxes: Pixels to solve on each panel.
         kept: Part of the middle panel that the rays pass through. By default, the middle panel's box.
         taper_px: Width of a window's taper, right and down, in middle-panel pixels.
-        points: Points of each pupil that have views of their own.
+        points: Points of each pupil that have separate views.
     """
     box = boxes[stack.count // 2]
     kept = kept or box

@@ -45,7 +45,7 @@ class Targets:
     # (V, 3) eye positions, frame `stack`: the first viewer's left and right eye, then the next viewer's
     eyes_m: F64
     views: tuple[TargetView, ...]  # what each of these eyes should see
-    # Points of each pupil that have views of their own; `eyes_m` and `views` list all eyes for each point in turn
+    # Points of each pupil that have separate views; `eyes_m` and `views` list all eyes for each point in turn
     points: int = 1
 
     @cached_property
