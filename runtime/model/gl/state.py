@@ -100,8 +100,8 @@ class GlState:
             weight, residual = self._rays(f"curvature {number}"), self._rays(f"gradient {number}")
             targets = {"targets": self._targets[view][0]}
             uniforms = {**self._through(matrices, view), **weights}
-            counts = (("PANELS", self._count),)
-            self._passes.draw("residual", (weight, residual), {**inputs, **targets}, uniforms, counts=counts)
+            panels: Counts = (("PANELS", self._count),)
+            self._passes.draw("residual", (weight, residual), {**inputs, **targets}, uniforms, counts=panels)
             fields.append((weight, residual))
         gathered, uniforms, counts = self._gathered(fields, sets, middle)
         last = {"last": self._panel("last", middle)}
@@ -267,7 +267,8 @@ def check_size(context: moderngl.Context, stack: PanelStack) -> None:
 def _summed(
     fields: Sequence[tuple[Image, Image]], back: F64, rays: tuple[int, int], *, grey: bool
 ) -> tuple[dict[str, Image], dict[str, Any], Counts]:
-    inputs, uniforms = {}, {"rays": rays, "grey": grey}
+    inputs: dict[str, Image] = {}
+    uniforms: dict[str, Any] = {"rays": rays, "grey": grey}
     for number, ((first, second), matrix) in enumerate(zip(fields, back, strict=True)):
         inputs |= {f"first{number}": first, f"second{number}": second}
         uniforms[f"rays_from{number}"] = _mat3(matrix)
