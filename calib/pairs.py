@@ -20,6 +20,7 @@ from runtime.errors import InputError
 from runtime.records import F64
 from runtime.support import untrusted_input
 from runtime.support.artifacts import write_text
+from runtime.support.spreadsheet import comma_separated
 
 MAX_PAIRS = 1_000_000  # maximum number of pairs in a file
 MAX_LISTED = 3  # maximum number of mistakes listed in a message
@@ -121,7 +122,7 @@ def _read_rows(path: Path) -> tuple[list[str], list[PairRow]]:
         labels = [f"pair {number}" for number in range(1, len(items) + 1)]
         columns = {name for item in items for name in item}
     else:
-        reader = csv.DictReader(io.StringIO(text), skipinitialspace=True)
+        reader = csv.DictReader(io.StringIO(comma_separated(text)), skipinitialspace=True)
         try:
             reader.fieldnames = [name.strip().lower() for name in reader.fieldnames or ()]
             columns = set(reader.fieldnames)

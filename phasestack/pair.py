@@ -21,7 +21,7 @@ from typing import Any, TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from phasestack.pictures import as_array, as_codes, as_picture
+from phasestack.pictures import as_array, as_codes, as_numbers, as_picture
 from phasestack.stack import checked_stack
 from runtime.errors import InputError, ModelFailure
 from runtime.evaluation.displayed import SIGMAS_MM, Picture
@@ -172,11 +172,14 @@ class Result:
 
         The files are the same as those written by `phasestack solve --out`.
         """
-        with OutputFolder(Path(out)) as folder:
-            self._pair.write(folder.staging, lines=[self._line, *self.notes])
-            told: dict[str, Any] = {"model": self.model, "eye_sigma_mm": self.eye_sigma_mm, "notes": self.notes}
-            told["total_ms"] = round(self.total_ms, 3)
-            write_json(folder.staging / "solve.json", self._pair.quality.table() | told)
+        told: dict[str, Any] = {"model": self.model, "eye_sigma_mm": self.eye_sigma_mm, "notes": self.notes}
+        told["total_ms"] = round(self.total_ms, 3)
+        try:
+            with OutputFolder(Path(out)) as folder:
+                self._pair.write(folder.staging, lines=[self._line, *self.notes])
+                write_json(folder.staging / "solve.json", self._pair.quality.table() | told)
+        except InputError as error:
+            raise ValueError(f"out: {error}") from None
 
 
 def solve(
@@ -265,9 +268,15 @@ def solve_each(
     """
     total = len(pairs) if isinstance(pairs, Sized) else None
     solve_one = partial(solve, stack=stack, fov_deg=fov_deg, model=model, eye_sigma_mm=eye_sigma_mm)
-    shown = ShownProgress(sys.stderr) if progress else None
+    shown = ShownProgress(sys.stderr) if progress and sys.stderr is not None else None
+    if not isinstance(pairs, Iterable):
+        raise ValueError("pairs: must be an iterable of (left picture, right picture, eyes_m)")
     try:
-        for number, (left, right, eyes_m) in enumerate(pairs):
+        for number, pair in enumerate(pairs):
+            try:
+                left, right, eyes_m = pair
+            except (TypeError, ValueError):
+                raise ValueError(f"pairs[{number}]: must be (left picture, right picture, eyes_m)") from None
             if shown is not None:
                 shown("solving", number, total)
             try:
@@ -396,7 +405,7 @@ def camera(eye_m: Sequence[float] | F64, *, width_px: int, height_px: int, fov_d
     for name, size in sizes.items():
         if not _number(name, size, 1, 1 << 16, "pixels").is_integer():
             raise ValueError(f"{name}: is {size!r}, not a whole number of pixels")
-    eye = np.asarray(eye_m, np.float64)
+    eye = as_numbers("eye_m", eye_m, "must be three numbers in metres")
     if eye.shape != (3,) or not np.isfinite(eye).all() or not eye.any():
         raise ValueError("eye_m: must be three finite numbers (in metres), not all zero")
     return image_from_stack(eye, fov_deg=_number("fov_deg", fov_deg, *FOV_RANGE_DEG, "degrees"), **sizes)
@@ -420,7 +429,7 @@ def project(
     Raises:
         ValueError: An argument is invalid. The message begins with the argument's name.
     """
-    points = np.asarray(points_m, np.float64)
+    points = as_numbers("points_m", points_m, "must be numbers in metres")
     if points.ndim < 1 or points.shape[-1] != 3:
         raise ValueError(f"points_m: must have shape (..., 3), but has shape {points.shape}")
     matrix = camera(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
@@ -475,8 +484,9 @@ def _checked(
             )
         eyes = _eyes(eyes_m, stack, count=len(pictures))
     else:
+        matrices_given = as_numbers("cameras", cameras, "must be 3x4 matrices, one for each picture")
         try:
-            matrices, places_m = as_cameras(cameras, count=len(pictures))
+            matrices, places_m = as_cameras(matrices_given, count=len(pictures))
             eyes = _eyes(places_m, stack, count=len(pictures))
             if eyes_m is not None and np.abs(_eyes(eyes_m, stack, count=len(pictures)) - eyes).max() > SAME_PLACE_M:
                 raise ValueError(f"are at {np.round(eyes, 4).tolist()}, which contradicts eyes_m; omit eyes_m")
@@ -522,10 +532,7 @@ def _eyes(eyes_m: Any, stack: PanelStack, *, count: int) -> F64:
             of the panels, or are too close together.
     """
     points = "two points" if count == 2 else f"{count} points, one for each picture,"
-    try:
-        eyes = np.asarray(eyes_m, np.float64)
-    except (TypeError, ValueError):
-        raise ValueError(f"eyes_m: must be {points} of three numbers in metres") from None
+    eyes = as_numbers("eyes_m", eyes_m, f"must be {points} of three numbers in metres")
     if eyes.shape != (count, 3) or not np.isfinite(eyes).all():
         raise ValueError(f"eyes_m: must be {points} of three finite numbers in metres; the shape is {eyes.shape}")
     if np.abs(eyes).max() > EYE_MOST_M:

@@ -12,7 +12,7 @@ from runtime.errors import InputError
 from runtime.evaluation.displayed import Picture
 from runtime.eyes import pupils
 from runtime.eyes.pupils import Pupils
-from runtime.records import U8
+from runtime.records import F64, U8
 from runtime.support.picture_file import rgb_of
 
 LEAST_PX = 16
@@ -65,7 +65,9 @@ def as_array(name: str, given: Any) -> Any:
         raise ValueError(
             f"{name}: must be a picture, not a file name; read it with PIL.Image.open({os.fspath(given)!r})"
         )
-    if hasattr(given, "detach"):  # a torch tensor
+    if hasattr(given, "read"):
+        raise ValueError(f"{name}: must be a picture, not an open file; pass PIL.Image.open({name})")
+    if _is_tensor(given):
         given = given.detach().cpu()
         given = given.float() if given.is_floating_point() else given
     try:
@@ -77,6 +79,28 @@ def as_array(name: str, given: Any) -> Any:
     if array.dtype.kind not in "buif":
         raise ValueError(f"{name}: must be an array of numbers, not {type(given).__name__}")
     return array
+
+
+def as_numbers(name: str, given: Any, told: str) -> F64:
+    """Convert numbers, or tensors on any device, to a float64 array.
+
+    Raises:
+        ValueError: The value does not consist of numbers. The message is `name` and `told`.
+    """
+    try:
+        return np.asarray(_detached(given), np.float64)
+    except (TypeError, ValueError, RuntimeError):
+        raise ValueError(f"{name}: {told}") from None
+
+
+def _detached(given: Any) -> Any:
+    if isinstance(given, list | tuple):
+        return [_detached(item) for item in given]
+    return given.detach().cpu() if _is_tensor(given) else given
+
+
+def _is_tensor(given: Any) -> bool:
+    return hasattr(given, "detach") and hasattr(given, "cpu")  # files also have a method `detach`
 
 
 def _from_pillow(name: str, image: Any) -> U8:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import fields
 
+from phasestack.pictures import as_numbers
 from runtime.config import StackGeometry, validated
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack, Tilt
@@ -38,7 +39,7 @@ class Stack(PanelStack):
         """Validate the geometry. Raises ValueError if an argument is invalid, naming the argument."""
         given = {"width_m": width_m, "height_m": height_m, "width_px": width_px, "height_px": height_px}
         try:
-            places = tuple(float(x) for x in x_m)
+            places = tuple(map(float, as_numbers("x_m", list(x_m), "")))
         except (TypeError, ValueError):
             raise ValueError(f"x_m: must list the panels' positions, such as (-0.03, 0.0, 0.03), not {x_m!r}") from None
         try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import subprocess
 import sys
@@ -483,3 +484,45 @@ def test_a_texture_that_repeats_has_no_known_disparity(period_px: int, sharp: bo
         pair = texture(-shift_px / 2), texture(shift_px / 2)
         assert disparity_doubts(pair, eyes, STACK, fov_deg=40) == []
     assert disparity_doubts(rectified(60), eyes, STACK, fov_deg=40) != []  # the same blocks only once
+
+
+def test_open_files_are_refused_by_name_and_left_open(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"x")
+    with (tmp_path / "a.png").open("rb") as file:
+        for given in (file, io.BytesIO(b"x")):
+            with pytest.raises(ValueError, match="left: must be a picture, not an open file"):
+                phasestack.solve(given, picture(), eyes_m=EYES, stack=STACK)  # type: ignore[arg-type]
+            assert given.read() == b"x"
+
+
+def test_tensors_that_need_gradients_are_taken_as_numbers() -> None:
+    torch = pytest.importorskip("torch")
+    eyes = torch.tensor(EYES, requires_grad=True)
+    sizes = {"width_px": 320, "height_px": 180}
+    expected = [phasestack.camera(eye, **sizes) for eye in EYES]
+    assert np.allclose([phasestack.camera(eye, **sizes) for eye in eyes], expected, atol=1e-3)
+    middle = phasestack.project(torch.zeros(3, requires_grad=True), eye_m=eyes[0], **sizes)
+    assert middle == pytest.approx([160, 90])
+    solved = phasestack.solve(picture(), picture(3), eyes_m=list(eyes), stack=STACK, model="fast")
+    assert solved.layers.shape[0] == 3
+    for name, call in (("eye_m", phasestack.camera), ("points_m", phasestack.project)):
+        with pytest.raises(ValueError, match=f"^{name}: must be"):
+            call("abc", **sizes, **({} if name == "eye_m" else {"eye_m": EYES[0]}))  # type: ignore[operator]
+
+
+@pytest.mark.parametrize(("pairs", "told"), [(None, "^pairs: must be an iterable"), ("ab", r"^pairs\[0\]: must be")])
+def test_pairs_of_another_form_are_refused_by_name(pairs: Any, told: str) -> None:
+    with pytest.raises(ValueError, match=told):
+        list(phasestack.solve_each(pairs, stack=STACK))
+
+
+def test_without_stderr_pairs_are_solved_and_a_file_as_folder_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Programs without a console have no stderr."""
+    monkeypatch.setattr(sys, "stderr", None)
+    (result,) = phasestack.solve_each([(picture(), picture(3), EYES)], stack=STACK, model="fast")
+    (tmp_path / "a").write_text("x")
+    with pytest.raises(ValueError, match=r"^out: .*a"):
+        result.save(tmp_path / "a")
+    assert (tmp_path / "a").read_text() == "x"

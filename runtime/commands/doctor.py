@@ -204,7 +204,7 @@ def opengl(settings: Settings) -> Iterator[Row]:
 def monitors(settings: Settings) -> Iterator[Row]:
     """Check that every configured panel's monitor is connected."""
     from runtime.errors import InputError, PanelLost
-    from runtime.panels.monitors import bind, check_modes, refresh_difference
+    from runtime.panels.monitors import bind, check_modes, gamma_warning, refresh_difference
     from runtime.panels.registry import panel_settings
 
     if settings.output.kind == "offscreen":
@@ -238,6 +238,8 @@ def monitors(settings: Settings) -> Iterator[Row]:
         yield Row("panels", "ok", f"panel {number} is {monitor}")
     if difference := refresh_difference(bound):
         yield Row("panels", "warn", difference, "set all panels to the same video mode")
+    if changed := gamma_warning(bound):
+        yield Row("panels", "warn", changed)
 
 
 def content(settings: Settings) -> Iterator[Row]:

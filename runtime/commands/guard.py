@@ -70,12 +70,26 @@ def _has_hung_thread() -> bool:
 
 def _code_of(app: Any) -> int:
     try:
-        app()
+        code = app(standalone_mode=False)
     except SystemExit as error:
         if isinstance(error.__context__, BrokenPipeError):  # typer turns a closed stdout into SystemExit
             return STDOUT_CLOSED
         return int(error.code or 0)
-    return 0
+    except Exception as error:
+        if not hasattr(error, "format_message"):
+            raise
+        return _misused(error)
+    return code if isinstance(code, int) else 0
+
+
+def _misused(error: Any) -> int:
+    """Report one of typer's usage errors in one line. Without arguments, it is the help."""
+    message, context = error.format_message(), getattr(error, "ctx", None)
+    if "\n" not in message:
+        command = context.command_path if context is not None else "phasestack"
+        message = f"phasestack: {message.rstrip('.')}; see `{command} --help`"
+    print(message, file=sys.stderr)
+    return int(error.exit_code)
 
 
 def _reported(error: BaseException) -> int:

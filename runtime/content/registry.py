@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote, urlsplit
 
 import numpy as np
 
@@ -101,6 +102,12 @@ def _prepared(file: SceneFile) -> Opener:
         from runtime.content import program
 
         return program.prepare(file)
+    if name.lower().startswith("file://"):
+        path = unquote(urlsplit(name).path)
+        return _prepared(replace(file, path=Path(path), settings=file.settings.model_copy(update={"scene": path})))
+    if name.lower().startswith(("smb://", "nfs://", "sftp://", "\\\\")):
+        problem = "is on another computer; mount the share, and set the path where it is mounted"
+        raise InputError("content", "scene", f"{untrusted_input.shown(without_secrets(name))} {problem}")
     if "://" in name or name.startswith("/dev/video"):
         problem = "live pictures require your own class (module:Class) or a program; see docs/content.md"
         raise InputError("content", "scene", f"{untrusted_input.shown(without_secrets(name))}: {problem}")

@@ -257,6 +257,7 @@ class Display:
                 width_px=mode.size.width,
                 height_px=mode.size.height,
                 refresh_hz=refresh_hz,
+                has_gamma=state is not None and state.has_gamma,
             )
             pairs.append((monitor, handle))
         return pairs

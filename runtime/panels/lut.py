@@ -9,6 +9,7 @@ import numpy as np
 from runtime.errors import InputError
 from runtime.records import F32
 from runtime.support import untrusted_input
+from runtime.support.spreadsheet import comma_separated
 
 ENTRIES = 256
 COLUMNS = ("phase", "red", "green", "blue")
@@ -28,7 +29,8 @@ def measured_curve(path: Path) -> F32:
         InputError: The file cannot be read or its content is invalid. The message names the file and says what is
             wrong.
     """
-    lines = [line for line in untrusted_input.read_text(path).splitlines() if line.strip() and line[0] != "#"]
+    text = comma_separated(untrusted_input.read_text(path))
+    lines = [line for line in text.splitlines() if line.strip() and line[0] != "#"]
     header = tuple(name.strip().lower() for name in lines[0].split(",")) if lines else ()
     if header not in (COLUMNS, ("phase", "grey")):
         raise InputError(

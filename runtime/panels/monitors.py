@@ -27,6 +27,12 @@ class Rectangle(NamedTuple):
     def __str__(self) -> str:
         return f"{self.width_px}x{self.height_px}+{self.x_px}+{self.y_px}"
 
+    def overlaps(self, other: Rectangle) -> bool:
+        """Return True if the two regions have pixels in common."""
+        across = min(self.x_px + self.width_px, other.x_px + other.width_px) - max(self.x_px, other.x_px)
+        down = min(self.y_px + self.height_px, other.y_px + other.height_px) - max(self.y_px, other.y_px)
+        return across > 0 and down > 0
+
 
 @dataclass(frozen=True, slots=True)
 class Monitor:
@@ -40,6 +46,7 @@ class Monitor:
     width_px: int
     height_px: int
     refresh_hz: float  # 0 if unknown
+    has_gamma: bool = False  # True if the X server changes the grey levels
 
     @property
     def place(self) -> Rectangle:
@@ -79,7 +86,8 @@ def bind(panels: Sequence[PanelSettings], monitors: Sequence[Monitor]) -> tuple[
 
     Raises:
         InputError: A panel's settings give neither a serial number nor a connector.
-        PanelLost: A panel's monitor is missing, ambiguous or already assigned. This may be temporary.
+        PanelLost: A panel's monitor is missing, ambiguous, already assigned or mirrored on another panel's. This may
+            be temporary.
     """
     ordered = in_order(monitors)
     bound: list[Monitor] = []
@@ -87,6 +95,13 @@ def bind(panels: Sequence[PanelSettings], monitors: Sequence[Monitor]) -> tuple[
         monitor = _find(number, panel, ordered)
         if monitor in bound:
             raise PanelLost(f"panels {bound.index(monitor)} and {number} cannot both use the monitor {monitor}")
+        for other, earlier in enumerate(bound):
+            if monitor.place.overlaps(earlier.place):
+                raise PanelLost(
+                    f"panels {other} and {number} would show the same pixels, because {earlier} and {monitor} overlap; "
+                    f"turn off mirroring, for example with `xrandr --output {monitor.connector} --right-of "
+                    f"{earlier.connector}`"
+                )
         bound.append(monitor)
     return tuple(bound)
 
@@ -128,6 +143,17 @@ def check_modes(panels: Sequence[PanelSettings], monitors: Sequence[Monitor], *,
                 f" but the stack has {width_px}x{height_px} pixels; change the mode, rotation_deg, or "
                 "stack.width_px and height_px"
             )
+
+
+def gamma_warning(monitors: Sequence[Monitor]) -> str:
+    """Return a one-line warning if the X server changes the panels' grey levels, or an empty string."""
+    changed = [monitor.connector for monitor in monitors if monitor.has_gamma]
+    if not changed:
+        return ""
+    return (
+        f"the X server changes the grey levels of {', '.join(changed)} (gamma, brightness or a night light), so the "
+        f"panels' curves are wrong; turn it off with `xrandr --output {changed[0]} --gamma 1:1:1 --brightness 1`"
+    )
 
 
 def refresh_difference(monitors: Sequence[Monitor]) -> str:

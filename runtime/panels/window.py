@@ -15,7 +15,7 @@ from runtime.panels.base import PanelSink
 from runtime.panels.card import identity_card
 from runtime.panels.display import Display, connected_monitors, glfw
 from runtime.panels.drawing import PanelWindows, WindowContextLost, open_windows
-from runtime.panels.monitors import Monitor, bind, check_modes, refresh_difference
+from runtime.panels.monitors import Monitor, bind, check_modes, gamma_warning, refresh_difference
 from runtime.panels.watch import PlacementWatch
 from runtime.records import U8, PanelFrame, PresentReport
 from runtime.support.gl import offscreen_context
@@ -166,6 +166,8 @@ class WindowPanels(PanelSink):
             check_modes(self._panels, self.monitors, width_px=layer_px[0], height_px=layer_px[1])
         if difference := refresh_difference(self.monitors):
             log.warning("%s", difference)
+        if changed := gamma_warning(self.monitors):
+            log.warning("%s", changed)
         self._windows = windows = open_windows(
             display, self._panels, self.monitors, layer_px=layer_px, clock=self._clock, on_processor=self._on_processor
         )

@@ -22,6 +22,8 @@ from runtime.errors import InputError
 from runtime.records import U8
 
 STAGING = ".phasestack-staging-"
+UMASK = os.umask(0o022)  # the system reports the mask only when it is set
+os.umask(UMASK)
 
 
 def sync(path: Path) -> None:
@@ -66,7 +68,7 @@ def write_bytes(path: Path, data: bytes, *, like: Path | None = None) -> None:
         if before is not None:
             with suppress(PermissionError):  # the replaced file may belong to another user
                 os.chown(name, before.st_uid, before.st_gid)
-        Path(name).chmod(0o644 if before is None else stat.S_IMODE(before.st_mode))
+        Path(name).chmod(0o666 & ~UMASK if before is None else stat.S_IMODE(before.st_mode))
         if any(part.startswith(STAGING) for part in path.parts):  # OutputFolder syncs its files when it exits
             Path(name).replace(path)
         else:

@@ -86,3 +86,11 @@ def test_a_file_of_another_sensor_is_not_gone_on_with(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="sensor A1, but this pair is from sensor B2"):
         PairsFile(path).accept(captured("v1", serial="B2"))
     assert len(read_pairs(path)) == 1
+
+
+def test_pairs_from_a_german_spreadsheet_are_read(tmp_path: Path) -> None:
+    text = ";".join(COLUMNS) + "\n0,1;0,2;-0,3;4;5,5;6\n"
+    found = read_pairs(file(tmp_path, text))
+    assert found.sensor_m.tolist() == [[0.1, 0.2, -0.3]] and found.stack_m.tolist() == [[4.0, 5.5, 6.0]]
+    with pytest.raises(InputError, match="line 2, sensor_y: is not a number"):
+        read_pairs(file(tmp_path, text.replace("0,2", "0,2,5")))

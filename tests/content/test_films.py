@@ -14,6 +14,7 @@ from runtime.config import ContentSettings
 from runtime.content.frames import Video
 from runtime.content.pictures import PicturesSource, open_frames
 from runtime.content.placing import SceneFile
+from runtime.content.registry import open_content
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.records import U8
@@ -189,9 +190,9 @@ def test_paper_white_of_a_pq_film_is_white(tmp_path: Path) -> None:
     """As for stills: 203 nits have the code 148, and half their light the code 130."""
     for transfer, name, white, half in ((16, "smpte2084", 148, 130), (18, "arib-std-b67", 191, 161)):
         for code, wanted in ((white, 255), (half, 188), (0, 0)):
-            colours = {"x265-params": f"log-level=none:colorprim=bt2020:transfer={name}:colormatrix=bt2020nc:crf=1"}
+            colours = {"x264-params": f"colorprim=bt2020:transfer={name}:colormatrix=bt2020nc:crf=1"}
             pictures = [(0, grey(code))]
-            path = write(tmp_path / "a.mp4", pictures, codec="libx265", pix_fmt="yuv420p10le", **colours)
+            path = write(tmp_path / "a.mp4", pictures, codec="libx264", pix_fmt="yuv420p10le", **colours)
             assert played(path, [0])[0] == pytest.approx(wanted, abs=10), (transfer, code)
 
 
@@ -214,3 +215,11 @@ def test_a_written_film_has_the_times_of_its_pictures(tmp_path: Path) -> None:
         writer.write(grey(100), time_ns=at_ms * MS)
     writer.close()
     assert (Film(tmp_path / "a.mp4").times_ns[:4] // MS).tolist() == [0, 33, 100, 400]
+
+
+def test_a_scene_may_be_a_file_url(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    path = write(tmp_path / "a film é.mp4", [(0, grey(90))])
+    source = open_content(ContentSettings(scene=path.as_uri()), stack, context)
+    assert source.info.name == "a film é"
+    with pytest.raises(InputError, match="is on another computer; mount the share"):
+        open_content(ContentSettings(scene="smb://nas/films/a.mp4"), stack, context)

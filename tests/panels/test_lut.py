@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from runtime.errors import InputError
-from runtime.panels.lut import curve
+from runtime.panels.lut import curve, measured_curve
 
 
 def test_without_a_curve_the_grey_is_the_phase() -> None:
@@ -56,3 +56,18 @@ def test_a_wrong_curve_is_refused_by_file_and_field(tmp_path: Path, text: str, f
         curve(lut=str(path), gamma=1.0)
     assert caught.value.source == str(path)
     assert caught.value.field == field
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "phase;grey\n0;0\n0,5;0,25\n1;1\n",
+        "phase\tgrey\n0\t0\n0,5\t0,25\n1\t1\n",
+        "sep=;\nphase;grey\n# measured; by hand\n0;0\n0,5;0,25\n1;1\n",
+        "\ufeffphase;grey\n0;0\n0.5;0.25\n1;1\n",
+    ],
+)
+def test_a_table_from_a_german_spreadsheet_is_read(tmp_path: Path, text: str) -> None:
+    (tmp_path / "a.csv").write_text(text, encoding="utf-8")
+    (tmp_path / "b.csv").write_text("phase,grey\n0,0\n0.5,0.25\n1,1\n")
+    assert np.array_equal(measured_curve(tmp_path / "a.csv"), measured_curve(tmp_path / "b.csv"))

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from runtime.config import PanelSettings
 from runtime.errors import InputError, PanelLost
-from runtime.panels.monitors import Monitor, bind, check_modes, refresh_difference
+from runtime.panels.monitors import Monitor, bind, check_modes, gamma_warning, refresh_difference
 
 
 def monitor(connector: str, serial: str = "", x_px: int = 0) -> Monitor:
@@ -80,3 +80,19 @@ def test_drifting_rates_are_reported_and_unknown_ones_not_guessed() -> None:
     assert refresh_difference([FULL, replace(FULL, refresh_hz=0.0)]) == ""
     told = refresh_difference([FULL, replace(FULL, connector="DP-2", refresh_hz=59.94)])
     assert "DP-1 60.00 Hz, DP-2 59.94 Hz" in told
+
+
+@pytest.mark.parametrize("place", [(0, 0), (1919, 0), (0, 1079)])
+def test_panels_on_mirrored_or_overlapping_monitors_are_refused(place: tuple[int, int]) -> None:
+    first = Monitor("DP-1", "", "", 0, 0, 1920, 1080, 60.0)
+    second = Monitor("DP-2", "", "", *place, 1920, 1080, 60.0)
+    panels = [PanelSettings(connector="DP-1"), PanelSettings(connector="DP-2")]
+    with pytest.raises(PanelLost, match=r"panels 0 and 1 would show the same pixels.*xrandr --output DP-2"):
+        bind(panels, [first, second])
+    bind(panels, [first, replace(second, x_px=1920)])
+
+
+def test_a_changed_gamma_is_told_with_the_way_back() -> None:
+    monitors = [Monitor(f"DP-{n}", "", "", 1920 * n, 0, 1920, 1080, 60.0, has_gamma=n == 1) for n in range(3)]
+    assert gamma_warning(monitors[:1]) == ""
+    assert "grey levels of DP-1" in gamma_warning(monitors) and "--output DP-1 --gamma 1:1:1" in gamma_warning(monitors)
