@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from phasestack import _rooms as _rooms  # must be the first import
+from phasestack.attaching import Attachment, attach
 from phasestack.example import ExamplePair, example_pair
 from phasestack.pair import Cameras, Eyes, Measuring, Result, camera, evaluate, project, solve, solve_each
 from phasestack.pictures import find_eyes
@@ -21,6 +22,7 @@ from runtime.support.version import version
 __version__ = version()
 
 __all__ = [
+    "Attachment",
     "Cameras",
     "Capabilities",
     "Cell",
@@ -45,6 +47,7 @@ __all__ = [
     "Stack",
     "Timing",
     "__version__",
+    "attach",
     "camera",
     "evaluate",
     "example_pair",

@@ -466,8 +466,10 @@ class ProgramServer:
 
     def _complete(self, number: int, frame: _Frame) -> None:
         with self._changed:
-            if self._frames.pop(number, None) is None:
+            if number not in self._frames:
                 return
+            # A program that answers a frame has given up those before it.
+            self._frames = {n: one for n, one in self._frames.items() if n > number}
             self.frame_ms = 1e3 * (time.monotonic() - frame.asked_s)
             if self.newest is None or number > self.newest.number:
                 self.newest = DrawnPictures(number, frame.pictures)
