@@ -1,4 +1,4 @@
-"""Place an application's scene in the display: similar to what its camera shows, and no deeper than is comfortable."""
+"""Place an application's scene in the display, similar to its own view and not too deep."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class EyeCamera:
 
 
 def axes_of(camera: AppCamera) -> F64:
-    """Return the rotation (3, 3) from the scene's axes to those of the stack: towards the viewer, right, up."""
+    """Return the rotation (3, 3) from the scene's axes to those of frame `stack`."""
     backwards = camera.position - camera.focus
     backwards = backwards / np.linalg.norm(backwards)
     right = np.cross(camera.up, backwards)

@@ -413,6 +413,20 @@ class ServiceSettings(Section):
     )
 
 
+class PoseSettings(Section):
+    """The head pose, sent as OpenTrack's UDP datagrams."""
+
+    port: Annotated[int, Field(ge=0, le=65535)] = Field(0, description="UDP port, usually 4242 (0 to send nothing)")
+    host: str = Field("127.0.0.1", description="computer to send to, by default this one")
+    rate_hz: Annotated[float, within(1.0, 240.0, "Hz")] = Field(60.0, description="largest number of poses per second")
+    smoothing_ms: Annotated[float, within(0.0, 1000.0, "ms")] = Field(
+        20.0, description="time constant for smoothing the pose (0 for none)"
+    )
+    origin_m: tuple[float, float, float] = Field(
+        (0.6, 0.0, 0.0), description="head position sent as 0: metres towards the viewer, to the viewer's right and up"
+    )
+
+
 class Settings(Section):
     """All settings, as printed by `phasestack config`."""
 
@@ -426,6 +440,7 @@ class Settings(Section):
     loop: LoopSettings = LoopSettings()
     plan: PlanSettings = PlanSettings()
     service: ServiceSettings = ServiceSettings()
+    pose: PoseSettings = PoseSettings()
 
     @model_validator(mode="after")
     def _agree(self) -> Settings:

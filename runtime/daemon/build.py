@@ -16,6 +16,7 @@ import cv2
 from runtime.browser.link import BrowserLink
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock, MonotonicClock, SimulatedClock
 from runtime.config import Settings
+from runtime.daemon.pose import PoseSender
 from runtime.daemon.solver_parts import RunningSolver, SolverMaker
 from runtime.errors import InputError, PanelLost, Stopped
 from runtime.eyes.calibration import load_calibration
@@ -234,6 +235,10 @@ def build_run(
         photon_ns=round(settings.loop.scanout_ms * NS_PER_MS),
         work_ns=round(sum(stage_ms.get(stage, 0.0) for stage in ("sensor", "track", "present")) * NS_PER_MS),
     )
+    pose = []
+    if settings.pose.port and not simulated:
+        pose.append(PoseSender(settings.pose))
+        cleanup.callback(pose[0].close)
     presenter = Presenter(
         maker.run,
         stack,
@@ -245,7 +250,7 @@ def build_run(
         panels=panels,
         stage_ms=stage_ms,
         supervisor=host,
-        observers=[observer] if host.recorder is None else [observer, host.recorder],
+        observers=[observer, *pose] if host.recorder is None else [observer, *pose, host.recorder],
         fixed=options.fixed,
     )
     if host.recorder is not None:

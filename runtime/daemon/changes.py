@@ -26,6 +26,7 @@ NEEDS_RESTART = (
     "output",
     "service",
     "loop",
+    "pose",
     "model.backend",
     "calibration.ipd_m",
 )  # settings read only when a run starts
