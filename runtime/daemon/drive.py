@@ -14,7 +14,7 @@ from runtime.config import Settings
 from runtime.daemon.build import Host, Run, RunOptions, build_run
 from runtime.errors import FatalError
 from runtime.evaluation.run_output import RunOutput
-from runtime.optics.alignment import shown_layers
+from runtime.optics.presentation import shown_layers
 from runtime.records import U8, RefreshAccount
 from runtime.support import progress
 from runtime.support.background import wait_for_all

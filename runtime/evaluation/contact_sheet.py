@@ -51,9 +51,7 @@ def contact_sheet(layers: U8, eye_views: EyeViews | None, *, headline: str, line
     error.
 
     Args:
-        layers: Layers from rear to front, shape (N, H, W, 3 or 4).
         eye_views: Retina images and targets, or None to leave out the eyes' rows.
-        headline: Sentence at the top that states the figure to quote.
         lines: Lines of text below the headline. Long lines are wrapped.
     """
     height, width = layers.shape[1:3]

@@ -42,8 +42,6 @@ class EyeViews:
         The page shows the first viewer's two views.
 
         Args:
-            layers: Layers from rear to front, shape (N, h, w, 3 or 4).
-            text: The page's title, followed by lines of text.
             relief: Relief of the content in the layers, shape (h, w) (`optics.relief`).
         """
         shown = [0, min(1, len(self.wanted) - 1)]  # the page shows the first viewer's eyes
@@ -74,14 +72,6 @@ def displayed(
     Targets with the panels' aspect ratio are compared at the panels' resolution. Other targets keep their resolution,
     unless they have more pixels than a panel, in which case they are reduced.
 
-    Args:
-        layers: Layers from rear to front, shape (N, H, W, 3 or 4).
-        wanted: Each eye's target picture.
-        stack: Panel geometry.
-        eyes_m: Eye positions, shape (V, 3), in the `stack` frame.
-        fov_deg: The targets' horizontal field of view.
-        similarity: Compute SSIM. If False, SSIM is NaN.
-
     Raises:
         ValueError: An eye is behind a panel or sees no part of the panels.
     """
@@ -108,10 +98,7 @@ def expected_quality(
     """Measure the expected quality of layers for several tracking errors.
 
     Args:
-        eye_views: Targets, eyes and geometry.
-        layers: Layers from rear to front, shape (N, H, W, 3 or 4).
         sampling: Rays to trace. By default, light is measured (`expected_errors`).
-        sigmas_mm: Tracking errors.
     """
     groups = sampling.groups if sampling else 0
     errors = dict.fromkeys(sigmas_mm, np.full(1 + groups, np.nan))

@@ -35,12 +35,7 @@ def write_motion(
     """Write a recording of a motion, and return a description of it.
 
     Args:
-        path: File to write.
-        motion: Name of the motion: a key in `MOTIONS`.
         seed: Seed for the path and the noise. 0 selects the benchmark's.
-        seconds: Duration of the recording.
-        rate_hz: Number of samples per second.
-        noise_mm: Standard deviation of the noise in the sampled positions.
 
     Raises:
         InputError: The motion is unknown, the length is out of range, or the file cannot be written.

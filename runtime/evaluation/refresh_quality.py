@@ -55,13 +55,6 @@ def view_error_mm(eyes_m: F64, solved_for_m: F64) -> float:
 def live_error(layers: U8, targets: Pictures, stack: PanelStack, *, eyes_m: F64, fov_deg: float) -> float:
     """Return the mean squared error of the light at two eyes.
 
-    Args:
-        layers: Layers as shown by the panels, shape (N, H, W, 3 or 4).
-        targets: Pictures that the eyes should see.
-        stack: Panel geometry.
-        eyes_m: Left and right eyes, shape (2, 3), in the `stack` frame.
-        fov_deg: The targets' horizontal field of view.
-
     Raises:
         ValueError: The eyes see no part of the panels.
     """
@@ -87,12 +80,8 @@ def measure_refresh(
     Measurements are omitted if the eyes see no part of the panels.
 
     Args:
-        account: The refresh's record. Live quality is measured only if it contains the true eyes.
-        layers: Layers as shown by the panels, shape (N, h, w, 4).
         carried: The layers aligned as if all content were on the middle panel, and the layers before alignment. None if
             the panels were not showing a solution on its own.
-        targets: Target pictures.
-        stack: Panel geometry.
         quick: Measure only the light at the aligned eyes, on fewer pixels, and leave out what the eyes see.
     """
     error = None

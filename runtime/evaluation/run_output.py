@@ -39,7 +39,6 @@ class RunOutput:
         """Create a writer, which must be entered as a context manager before use.
 
         Args:
-            target: Folder to write the files to.
             every_one: Wait for a slow disk. If False, drop lines and pictures that the disk is too slow for.
         """
         self._folder = OutputFolder(target)
@@ -94,7 +93,6 @@ class RunOutput:
         """Queue a refresh's layers for the folder `light/<frame>/`.
 
         Args:
-            frame: Refresh number.
             layers: Layers as shown by the panels, shape (N, h, w, 3 or 4). The caller must not modify the array
                 afterwards.
         """
@@ -111,12 +109,6 @@ class RunOutput:
         """Queue a refresh's light.json and target pictures for the folder `light/<frame>/`.
 
         The caller must not modify the pictures afterwards.
-
-        Args:
-            frame: Refresh number.
-            info: Contents of light.json.
-            drawn: Targets for the eyes the layers were solved for.
-            true: Targets for the true eyes.
         """
 
         def write() -> None:
@@ -142,7 +134,6 @@ class RunOutput:
         """Queue the files to be written at the end of a run. After a disk failure, write only summary.json.
 
         Args:
-            summary: Contents of summary.json.
             layers: The last refresh's layers, shape (N, h, w, 3 or 4). None: write only summary.json.
             moment: Last measured refresh, used for the contact sheet, the eye views and the viewer page.
             unseen: Viewer page to write if no refresh was measured.
@@ -180,7 +171,6 @@ class RunOutput:
         """Queue a job and return True, or return False if the job was dropped.
 
         Args:
-            work: Job to run on the writing thread.
             then: Cleanup that runs after the job, even if the job failed or was skipped.
         """
         if self.problem:

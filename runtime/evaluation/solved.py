@@ -76,7 +76,6 @@ class SolvedPair:
         """Measure quality without SSIM at a subset of the pixels, including the standard error of light.
 
         Args:
-            sigmas_mm: Tracking errors.
             every: Step between measured pixels and between measured rows. 1: all pixels, with no standard error.
         """
         views = displayed(
@@ -102,12 +101,7 @@ class SolvedPair:
         return self.eye_views.viewer(self.layers, [headline(self.quality.light_db["1"]), *lines])
 
     def write(self, folder: Path, *, lines: Sequence[str]) -> None:
-        """Write the layers, eye views, contact sheet and viewer page to a folder.
-
-        Args:
-            folder: Folder to write to; must exist.
-            lines: Lines of text to show below the headline on the contact sheet and the viewer page.
-        """
+        """Write the layers, eye views, contact sheet and viewer page to a folder."""
         for n, layer in enumerate(self.layers):
             write_png(folder / f"layer-{n}.png", layer)
         self.eye_views.write(folder)

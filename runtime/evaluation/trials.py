@@ -33,8 +33,6 @@ def timed(
     """Time repeated runs of a call. The first run is a warm-up, which does not count unless it is slow.
 
     Args:
-        call: Function to time.
-        runs: Minimum number of timed runs.
         most: Maximum number of timed runs. None: `runs`.
         enough_s: Once the timed runs have taken this long in total, no further run is started.
         slow_s: If the first run takes at least this long, it counts and is the only run.
@@ -54,7 +52,6 @@ def timed_in_turn(ways: Mapping[str, Callable[[], U8]], *, runs: int) -> dict[st
 
     Args:
         ways: Calls, keyed by name. Their last results are copied, because a call may reuse the buffer it returns.
-        runs: Number of timed runs of each call, after a single warm-up run.
 
     Returns:
         Each call's times and last result, keyed by name.

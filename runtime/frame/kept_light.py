@@ -12,7 +12,7 @@ from runtime.evaluation.refresh_quality import Pictures, RefreshTargets
 from runtime.frame.presenter import Refresh
 from runtime.frame.targets import TargetDrawer
 from runtime.frame.truth import TrueEyes
-from runtime.optics.alignment import shown_layers
+from runtime.optics.presentation import shown_layers
 from runtime.records import F64, U8, RefreshAccount
 from runtime.support import progress
 from runtime.support.background import MEASURING_NICENESS, BackgroundJob

@@ -15,7 +15,8 @@ from runtime.clock import NS_PER_S
 from runtime.model.geometry import panel_from_middle
 from runtime.model.job import Job
 from runtime.model.solver import REDUCTIONS
-from runtime.optics.relief import displacement, parallax
+from runtime.optics.presentation import displacement
+from runtime.optics.relief import parallax
 from runtime.records import F32, F64, U8, Effort, Measures
 from runtime.support.gl import DrawnPicture
 
@@ -167,16 +168,14 @@ def _moved_grid(pictures: Sequence[U8], job: Job, eyes_m: F64) -> list[F32]:
         job: The job that was solved.
         eyes_m: Eyes after the movement, shape (2, 3).
     """
-    middle = job.stack.count // 2
-    moved = displacement(
-        job.relief, parallax(job.stack, old_m=job.eyes_m.mean(axis=0), new_m=eyes_m.mean(axis=0)), middle
-    )
-    if moved is None:
+    stack = job.stack
+    moved = parallax(stack, old_m=job.eyes_m.mean(axis=0), new_m=eyes_m.mean(axis=0))
+    if moved is None or job.relief is None:
         return [_grid(picture) for picture in pictures]
     rows, columns = _grid_lines(pictures[0])
     u0, v0 = (0, 0) if job.window is None else (job.window.box.u0, job.window.box.v0)
-    size_px = job.stack.width_px, job.stack.height_px
-    right, down = moved.at(2 * columns + (u0 + 1.0), 2 * rows + (v0 + 1.0), size_px=size_px)
+    u, v = 2 * columns[None] + (u0 + 1.0), 2 * rows[:, None] + (v0 + 1.0)  # middles of 2 x 2 of the raster's pixels
+    right, down = displacement(moved, stack.count // 2, job.relief, (stack.width_px, stack.height_px), u, v)
     u, v = (columns + right / 2).astype(np.float32), (rows[:, None] + down / 2).astype(np.float32)
     warped = [cv2.remap(picture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for picture in pictures]
     return [np.asarray(picture[..., :3] / np.float32(255), np.float32) for picture in warped]

@@ -24,7 +24,7 @@ from runtime.evaluation.refresh_quality import FIGURES, RefreshQuality, RefreshT
 from runtime.frame.presenter import Refresh
 from runtime.frame.targets import TargetDrawer
 from runtime.frame.truth import TrueEyes
-from runtime.optics.alignment import shown_layers
+from runtime.optics.presentation import shown_layers
 from runtime.optics.quality import psnr_db
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, State

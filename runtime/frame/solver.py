@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import sys
 from dataclasses import dataclass, field, replace
 from time import perf_counter_ns
 
@@ -243,9 +242,7 @@ class Solver:
 
     @staticmethod
     def _plan_of(state: RunState, seeing: tuple[bool, bool], measured: Measured) -> Plan:
-        return make_plan(
-            state.content.info, state.settings, seeing=seeing, measured=measured, loaded_modules=sys.modules
-        )
+        return make_plan(state.content.info, state.settings, seeing=seeing, measured=measured)
 
     def _failed(self, part: str, error: BaseException, *, expected: type[Exception]) -> dict[str, str]:
         self._missing[part] = str(error).splitlines()[0] if str(error) else type(error).__name__

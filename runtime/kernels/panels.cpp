@@ -31,7 +31,8 @@ struct Shown {
   const uint32_t *curve;  // (3, CURVE) the screen's pixels with one byte each, blue, green and red; or null
   const float *relief;   // (relief_rows, relief_columns), or null
   int32_t source_rows, source_columns, rows, columns, relief_rows, relief_columns, panel_rows, panel_columns;
-  ScaleShift source_from_panel, relief_from_screen;
+  ScaleShift source_from_panel;
+  ScaleShift relief_from_screen;  // from the panel's pixels if `registered` is 1
   ScaleShift push;             // displacement, in the source's pixels, by a relief of 1, from positions on the panel
   int32_t registered;          // 1 if `panel_from_screen` applies
   float panel_from_screen[9];  // homography; outside the panel, the screen shows the value 0
@@ -148,8 +149,18 @@ INLINE void locate(const Shown &shown, int r, int begin, int count, const float 
   }
 }
 
+// Return the relief at a position in its pixels.
+INLINE float relief_at(const Shown &shown, float x, float y) {
+  x = std::min(std::max(x, 0.0f), float(shown.relief_columns - 1)), y = std::min(std::max(y, 0.0f), float(shown.relief_rows - 1));
+  const int column = int(x), row = int(y);
+  const float *line = shown.relief + int64_t(row) * shown.relief_columns + column;
+  const int next = column + 1 < shown.relief_columns, below = row + 1 < shown.relief_rows ? shown.relief_columns : 0;
+  const float right = x - float(column), top = line[0] + (line[next] - line[0]) * right;
+  return top + (line[below] + (line[below + next] - line[below]) * right - top) * (y - float(row));
+}
+
 // Do the same for a panel with a homography, and find which pixels are inside the panel.
-INLINE void locate_registered(const Shown &shown, int r, int begin, int count, const float *upper, const float *lower, float share, Block &block) {
+INLINE void locate_registered(const Shown &shown, int r, int begin, int count, Block &block) {
   const ScaleShift at = shown.source_from_panel, push = shown.push;
   const int32_t stride = int32_t(shown.source_stride), rows = shown.source_rows, columns = shown.source_columns;
   const float *h = shown.panel_from_screen, y = float(r) + 0.5f;
@@ -158,8 +169,13 @@ INLINE void locate_registered(const Shown &shown, int r, int begin, int count, c
   auto *right = reinterpret_cast<Word *>(block.right), *down = reinterpret_cast<Word *>(block.down);
   auto *inside = reinterpret_cast<Word *>(block.inside);
   float raised[BLOCK_PX] = {};
-  if (upper)
-    for (int k = 0; k < count; ++k) raised[k] = upper[begin + k] + (lower[begin + k] - upper[begin + k]) * share;
+  if (shown.relief) {
+    const ScaleShift to = shown.relief_from_screen;
+    for (int k = 0; k < count; ++k) {
+      const float x = float(begin + k) + 0.5f, w = w0 + wu * x;
+      raised[k] = relief_at(shown, (u0 + uu * x) / w * to.scale_u + to.shift_u, (v0 + vu * x) / w * to.scale_v + to.shift_v);
+    }
+  }
   VECTORISED for (int k = 0; k < count; ++k) {
     const float x = float(begin + k) + 0.5f, w = w0 + wu * x;
     const float u = (u0 + uu * x) / w, v = (v0 + vu * x) / w, relief = raised[k];
@@ -231,7 +247,7 @@ INLINE void store(const Shown &shown, uint8_t *screen, int count, Block &block) 
 INLINE void draw_row(const Shown &shown, int r, uint8_t *screen, Relief &kept, Block &block) {
   const float *upper = nullptr, *lower = nullptr;
   float share = 0;
-  if (shown.relief) {
+  if (shown.relief && !shown.registered) {
     const ScaleShift &at = shown.relief_from_screen;
     const float v = std::clamp((float(r) + 0.5f) * at.scale_v + at.shift_v, 0.0f, float(shown.relief_rows - 1));
     share = v - float(int(v));
@@ -240,7 +256,7 @@ INLINE void draw_row(const Shown &shown, int r, uint8_t *screen, Relief &kept, B
   for (int c = 0; c < shown.columns; c += BLOCK_PX) {
     const int count = std::min(BLOCK_PX, shown.columns - c), n = c / BLOCK_PX;
     const bool rises = upper && (kept.rises[0][n] || kept.rises[1][n]);
-    if (shown.registered) locate_registered(shown, r, c, count, rises ? upper : nullptr, lower, share, block);
+    if (shown.registered) locate_registered(shown, r, c, count, block);
     else locate(shown, r, c, count, rises ? upper : nullptr, lower, share, block);
     interpolate(shown, count, block);
     if (shown.registered) clear_outside(count, block);
@@ -260,13 +276,13 @@ INLINE ScaleShift halved(const ScaleShift &map) {
 INLINE Shown halved(const Shown &shown) {
   Shown half = shown;
   half.rows = shown.rows / 2 + 1, half.columns = shown.columns / 2 + 1;
-  half.relief_from_screen = halved(shown.relief_from_screen);
   if (shown.registered) {
     for (float *row = half.panel_from_screen; row < half.panel_from_screen + 9; row += 3)
       row[2] -= 0.5f * (row[0] + row[1]), row[0] *= 2, row[1] *= 2;
   } else {
     half.source_from_panel = halved(shown.source_from_panel);
     half.push = halved(shown.push);
+    half.relief_from_screen = halved(shown.relief_from_screen);
   }
   half.curve = nullptr;
   return half;

@@ -59,10 +59,6 @@ def looking_at_origin(
     The new pictures cover as much of the panels as all originals allow, and are sampled bicubically. If all cameras
     are already aimed at the origin, their pictures are returned unchanged.
 
-    Args:
-        cameras: (V, 3, 4) projections from frame `stack` to picture pixels (`as_cameras`).
-        eyes_m: (V, 3) camera positions in frame `stack`.
-
     Returns:
         The resampled (h, w, 3) pictures, and their horizontal field of view in degrees.
 
@@ -140,13 +136,7 @@ def _slope(matrix: F64) -> F64:
 
 
 def doubts(eyes_m: ArrayLike, stack: PanelStack, *, fov_deg: float, size: tuple[int, int]) -> list[str]:
-    """Return a one-line warning for each likely mistake in `eyes_m` or `fov_deg`.
-
-    Args:
-        eyes_m: (V, 3) eye positions in frame `stack`: the first viewer's left and right eye, then the next viewer's.
-        fov_deg: The pictures' horizontal field of view.
-        size: Picture width and height in pixels.
-    """
+    """Return a one-line warning for each likely mistake in `eyes_m` or `fov_deg`."""
     eyes, warnings = np.asarray(eyes_m, np.float64), []
     if fov_deg <= math.pi:
         warnings.append(

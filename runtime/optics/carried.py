@@ -36,13 +36,6 @@ def carried_db(
 ) -> float:
     """Return the PSNR of layers seen from `eyes_m`, measured with one ray per pixel.
 
-    Args:
-        layers: (N, H, W, 3 or 4) code values as the panels receive them, rear to front.
-        drawn: The (h, w, 3) retina picture for each of the eyes `solved_for_m`, as code values or float in [0, 1].
-        solved_for_m: (V, 3) eyes that the layers were solved for, in frame `stack`.
-        eyes_m: (V, 3) true eye positions in frame `stack`.
-        fov_deg: The retina pictures' horizontal field of view.
-
     Raises:
         ValueError: An eye is not in front of every panel, or the eyes see no part of the panels.
     """
@@ -82,12 +75,8 @@ def expected_errors(
     each pixel instead of four.
 
     Args:
-        layers: (N, H, W, 3 or 4) code values as the panels receive them, rear to front.
-        drawn: An (h, w, 3) retina picture for each of the eyes that the layers were solved for, as code values or
-            float in [0, 1].
         sampling: Rays to trace. By default `LIGHT`, which gives the figure to quote, but with four times as many rays
             per pixel if a picture has at most `PLENTY` values.
-        **at: Viewing conditions (`AtEyes`).
 
     Returns:
         For each standard deviation in mm, an array that holds the error over all rows, then the error over each group

@@ -90,8 +90,6 @@ def _compared(pictures: Sequence[U8 | F32], eyes_m: F64, stack: PanelStack, *, f
 
     Args:
         pictures: Left and right (h, w, 3) picture, each from a camera at the eye that is aimed at the stack's origin.
-        eyes_m: (2, 3) left and right eye in frame `stack`.
-        fov_deg: The pictures' horizontal field of view.
     """
     small = replace(stack, width_px=WIDTH_PX, height_px=max(16, round(WIDTH_PX * stack.height_m / stack.width_m)))
     panel, size = small.panel(stack.count // 2), (WIDTH_PX, small.height_px)
@@ -144,8 +142,6 @@ def disparity_doubts(
 
     Args:
         pictures: Left and right (h, w, 3) picture, each from a camera at the eye that is aimed at the stack's origin.
-        eyes_m: (2, 3) left and right eye in frame `stack`.
-        fov_deg: The pictures' horizontal field of view.
         parallel: True if the pictures might be a rectified pair from parallel cameras, passed by mistake. The warning
             says so if the disparities suggest it.
     """

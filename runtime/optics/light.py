@@ -71,14 +71,6 @@ def squared_errors(
     A carried target is a picture treated as if it were painted on the centre panel (docs/contracts.md). A pixel counts
     if all its rays cross every panel at least half a pixel inside the panel's edge.
 
-    Args:
-        layers: (N, H, W, 3 or 4) code values, rear to front.
-        targets: (h, w, 3) intensities, for each of the eyes `solved_for_m`.
-        solved_for_m: (V, 3) eyes that the layers were solved for, in frame `stack`.
-        eyes_m: (V, 3) true eye positions in frame `stack`.
-        fov_deg: The targets' horizontal field of view.
-        sampling: Rays to trace.
-
     Returns:
         (1 + groups,) errors. The first is over all rows. Each of the others is over one of the interleaved groups of
         rows; their scatter gives the first one's standard error. If the light is nearly perfect, an error can be
@@ -140,11 +132,6 @@ def view_of(
     """Return one eye's target and rays.
 
     Args:
-        side: The eye's number, from 0.
-        nominal_m: (3,) eye position that the layers were solved for, in frame `stack`.
-        true_m: (3,) true eye position in frame `stack`.
-        target: (h, w, 3) intensities that the nominal eye should see.
-        fov_deg: The target's horizontal field of view.
         pupil_mm: Pupil diameter. If 0, the eye is a pinhole.
 
     Raises:
@@ -165,9 +152,6 @@ def first_ray(side: int) -> int:
 
 def panels_from_centre(true_m: F64, stack: PanelStack) -> F64:
     """Return the homographies from centre-panel pixels to the pixels of every layer.
-
-    Args:
-        true_m: (..., 3) eye positions in frame `stack`.
 
     Returns:
         (..., N, 3, 3) homographies along each eye's rays.

@@ -32,11 +32,6 @@ def ssim(a: F32, b: F32, mask: Mask) -> float:
     """Return the mean structural similarity of two images over a mask (Wang et al. 2004).
 
     The window is an 11x11 Gaussian with a standard deviation of 1.5 pixels.
-
-    Args:
-        a: (h, w, C) image with intensities in [0, 1].
-        b: Image of the same shape.
-        mask: (h, w) mask of the pixels to average over.
     """
 
     def blur(x: F32) -> F32:
@@ -75,9 +70,6 @@ def quality(seen: Sequence[F32], targets: Sequence[F32], masks: Sequence[Mask], 
     """Return the displayed quality of the images that the eyes see.
 
     Args:
-        seen: For each eye, the (h, w, 3) image it sees, with intensities in [0, 1].
-        targets: For each eye, the (h, w, 3) picture it should see.
-        masks: For each eye, an (h, w) mask of the pixels that count.
         similarity: True to compute the SSIM. If False, the SSIM is NaN.
 
     Raises:

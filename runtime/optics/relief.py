@@ -14,12 +14,9 @@ panel crosses that panel.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, Parallax
@@ -28,16 +25,11 @@ WIDEST_PX = 480  # maximum number of columns in a relief; more columns would not
 RIM_PX = 2  # relief pixels that nearer content is dilated by, so that its outline moves with it
 COARSE_RIM_PX = 1  # RIM_PX for coarse rasters, whose reliefs have fewer pixels
 
-Pixels = NDArray[np.floating[Any]]
-
 
 def block_px(width_px: int) -> int:
     """Return the side, in raster pixels, of the square block covered by one relief pixel.
 
     A coarse raster uses the same number, although its pixels are larger.
-
-    Args:
-        width_px: Number of columns in the full raster.
     """
     return -(-width_px // WIDEST_PX)
 
@@ -90,62 +82,3 @@ def parallax(stack: PanelStack, *, old_m: F64, new_m: F64) -> Parallax | None:
         -(k * new[2] - old[2] + growth * middle.top_m) / middle.pitch_v_m,
     )
     return Parallax(drift_px, growth, tuple(places), tuple(weights))
-
-
-@dataclass(frozen=True, slots=True)
-class Displacement:
-    """Correction to a panel's alignment for content off the middle panel.
-
-    The fields are the content's relief and the fields of `Parallax` for a single panel.
-    """
-
-    relief: F32  # (h, w)
-    drift_px: tuple[float, float]
-    growth: float
-    middle_from_shown: F64  # (3, 3)
-    weight: float
-
-    def at(self, columns: Pixels, rows: Pixels, *, size_px: tuple[int, int]) -> tuple[F32, F32]:
-        """Return the displacements to add to the aligned positions of the panel's pixels.
-
-        Args:
-            columns: Horizontal positions of the pixel centres.
-            rows: Vertical positions of the pixel centres.
-            size_px: Panel width and height in pixels.
-
-        Returns:
-            Displacements to the right and displacements down, each with shape (rows, columns), in panel pixels.
-        """
-        scale_u, scale_v = self.middle_from_shown[0, 0], self.middle_from_shown[1, 1]
-        u = columns * scale_u + self.middle_from_shown[0, 2]
-        v = rows * scale_v + self.middle_from_shown[1, 2]
-        height, width = self.relief.shape
-        low_u, right = _between_centres(u * (width / size_px[0]), width)
-        low_v, down = _between_centres(v * (height / size_px[1]), height)
-        lines = (
-            self.relief[low_v] * (1 - down)[:, None] + self.relief[np.minimum(low_v + 1, height - 1)] * down[:, None]
-        )
-        b = lines[:, low_u] * (1 - right) + lines[:, np.minimum(low_u + 1, width - 1)] * right
-        b *= np.float32(self.weight)
-        across = np.asarray(self.drift_px[0] + self.growth * u, np.float32)
-        along = np.asarray(self.drift_px[1] + self.growth * v, np.float32)
-        return b * across, b * along[:, None]
-
-
-def displacement(relief: F32 | None, parallax: Parallax | None, panel: int) -> Displacement | None:
-    """Return the displacement of a panel's pixels, or None if `relief` or `parallax` is None."""
-    if relief is None or parallax is None:
-        return None
-    return Displacement(
-        relief, parallax.drift_px, parallax.growth, parallax.middle_from_shown[panel], parallax.weights[panel]
-    )
-
-
-def _between_centres(place: Pixels, count: int) -> tuple[NDArray[np.intp], F32]:
-    """Return the last of `count` pixel centres before each position, and the distance between the two.
-
-    The centre is given by its index. Positions beyond the outermost centres are clamped.
-    """
-    inside = np.clip(place - 0.5, 0.0, count - 1.0)
-    low = np.floor(inside)
-    return low.astype(np.intp), (inside - low).astype(np.float32)

@@ -103,7 +103,6 @@ class Rays:
         """Return the positions u and v where rays cross a raster, in raster pixels (M_RPU).
 
         Args:
-            rows: Image rows whose rays are traced.
             moved: (3, 3) homography to apply to the positions afterwards.
 
         Returns:
@@ -146,11 +145,7 @@ def seen_by(
     Implements equations (6) and (7) of the supplement.
 
     Args:
-        eye_m: (3,) eye in frame `stack`.
         layers: (N, H, W, 3 or 4) layers, rear to front, as code values or float in [0, 1]. A fourth channel is ignored.
-        fov_deg: The image's horizontal field of view.
-        width_px: Image width. By default, the layers' width.
-        height_px: Image height. By default, the layers' height.
 
     Raises:
         ValueError: The eye is not in front of every panel.

@@ -18,9 +18,6 @@ def panel_from_image(image_from_stack: F64, raster: PlaneRaster) -> F64:
     The homography is computed as an adjugate, which stays accurate at grazing angles, and is scaled so that its largest
     entry has magnitude 1.
 
-    Args:
-        image_from_stack: (3, 4) projection from frame `stack` to the eye's image.
-
     Raises:
         ValueError: The eye is in the panel's plane, or the projection is not finite.
     """

@@ -23,12 +23,7 @@ UNSEEN_PX = 0.05  # displacements smaller than this, in panel pixels, are ignore
 
 
 def layer_from_seen(stack: PanelStack, index: int, eye_m: F64) -> F64:
-    """Return the 3x3 homography from the ideal panel's points (y, z, 1) to the layer's points (y, z, 1).
-
-    Args:
-        index: Panel number.
-        eye_m: (3,) eye looking at the ideal panel, in frame `stack`.
-    """
+    """Return the 3x3 homography from the ideal panel's points (y, z, 1) to the layer's points (y, z, 1)."""
     if stack.tilt is None or not any(stack.tilt.depth[index]):
         return np.eye(3)
     return _projected(stack.tilt.depth[index], stack.tilt.seen_from_m, _triple(eye_m), stack.x_m[index])

@@ -32,7 +32,6 @@ class PanelSink(ABC):
         arrays until it has presented another frame, because the output may still be reading them.
 
         Args:
-            frame: The frame to show.
             unchanged: True if the frame is certain to show the same picture as the previous one. A panel that is
                 already showing this picture then skips the update, so displaying the flat picture with no viewer
                 present costs almost nothing.

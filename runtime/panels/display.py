@@ -157,8 +157,6 @@ class Display:
         """Open a borderless window that fills a monitor, and make its context current, if it has one.
 
         Args:
-            monitor: The monitor.
-            title: The window's title.
             opengl: True to create a context that shares objects with the root window's.
 
         Raises:

@@ -12,10 +12,11 @@ import moderngl
 from runtime.clock import Clock
 from runtime.config import PanelSettings
 from runtime.errors import PanelLost
+from runtime.optics.presentation import Mount, panel_draws
 from runtime.optics.rect import PixelRect
 from runtime.panels.display import Display, Window, gl_function, glfw, x_display
 from runtime.panels.monitors import Monitor
-from runtime.panels.presentation import FrameTextures, Painter
+from runtime.panels.presentation import FrameTextures, Painter, mount_of
 from runtime.panels.processor import Mounting, ProcessorPainter
 from runtime.panels.shared_picture import NotShared, SharedPicture, finish, flush
 from runtime.records import PanelFrame
@@ -78,31 +79,21 @@ class ShaderWindows(PanelWindows):
 
     opengl = True
 
-    def __init__(
-        self, display: Display, panels: Sequence[PanelSettings], monitors: Sequence[Monitor], layer_px: tuple[int, int]
-    ) -> None:
+    def __init__(self, display: Display, monitors: Sequence[Monitor], mounts: Sequence[Mount]) -> None:
         """Open the windows.
 
-        Args:
-            display: Connection to the X server.
-            panels: Panel settings, rear to front.
-            monitors: Each panel's monitor.
-            layer_px: Width and height of each of the stack's panels.
-
-        Raises:
-            InputError: A grey curve's file cannot be read or is invalid.
-            PanelLost: A monitor is no longer connected, or the X server does not support OpenGL.
+        Raises PanelLost if a monitor is no longer connected, or the X server does not support OpenGL.
         """
         super().__init__()
         self._display = display
         display.root.make_current()
-        self._textures = FrameTextures(display.root.gl, layer_px, count=len(panels))
+        self._textures = FrameTextures(display.root.gl, count=len(mounts))
         self._painters: list[Painter] = []
         try:
-            for number, (panel, monitor) in enumerate(zip(panels, monitors, strict=True)):
+            for number, (mount, monitor) in enumerate(zip(mounts, monitors, strict=True)):
                 window = display.fullscreen_window(monitor, title=f"panel {number}")
                 self.windows.append(window)
-                self._painters.append(Painter(window.gl, panel, screen_px=monitor.size_px, layer_px=layer_px))
+                self._painters.append(Painter(window.gl, mount))
                 glfw.swap_interval(1 if number == 0 else 0)
         except BaseException:
             self.release()
@@ -115,12 +106,13 @@ class ShaderWindows(PanelWindows):
             self._textures.upload(frame)
             # The other contexts may not use the textures until the upload has finished.
             root.gl.finish()
-        for panel, (window, painter) in enumerate(zip(self.windows, self._painters, strict=True)):
+        draws = panel_draws(frame, [painter.mount for painter in self._painters])
+        for panel, (window, painter, draw) in enumerate(zip(self.windows, self._painters, draws, strict=True)):
             window.make_current()
             context = window.gl
             context.screen.use()
-            context.viewport = (0, 0, *painter.screen_px)
-            painter.draw(self._textures, frame, panel)
+            context.viewport = (0, 0, *painter.mount.screen_px)
+            painter.draw(self._textures, draw, panel)
             context.finish()
             if fault := _reset_status() or _error(context):
                 raise WindowContextLost(f"the OpenGL context of panel {panel} failed: {fault}")
@@ -155,22 +147,14 @@ class ProcessorWindows(PanelWindows):
     def __init__(
         self,
         display: Display,
-        panels: Sequence[PanelSettings],
         monitors: Sequence[Monitor],
+        mounts: Sequence[Mount],
         mountings: Sequence[Mounting],
         clock: Clock,
     ) -> None:
         """Open the windows.
 
-        Args:
-            display: Connection to the X server.
-            panels: Panel settings, rear to front.
-            monitors: Each panel's monitor.
-            mountings: Each panel's mounting.
-            clock: The run's clock.
-
         Raises:
-            InputError: A grey curve's file cannot be read or is invalid.
             NotShared: The X server cannot reach this process's memory.
             PanelLost: A monitor is no longer connected.
         """
@@ -188,7 +172,7 @@ class ProcessorWindows(PanelWindows):
                     )
                 )
             screens = [picture.pixels for picture in self._pictures]
-            self._painter = ProcessorPainter(panels, mountings, screens)
+            self._painter = ProcessorPainter(mounts, mountings, screens)
             self._copy_ns = self._measured_copy_ns(clock)
         except BaseException:
             self.release()
@@ -251,11 +235,6 @@ def open_windows(
     """Open a fullscreen window for each panel.
 
     Args:
-        display: Connection to the X server.
-        panels: Panel settings, rear to front.
-        monitors: Each panel's monitor.
-        layer_px: Width and height of each of the stack's panels.
-        clock: The run's clock.
         on_processor: True to draw on the processor if that is possible, False to draw by OpenGL, or None to draw on the
             processor if OpenGL would too.
 
@@ -263,18 +242,23 @@ def open_windows(
         InputError: A grey curve's file cannot be read or is invalid.
         PanelLost: A monitor is no longer connected, or the X server does not support OpenGL.
     """
+    mounts = [
+        mount_of(panel, screen_px=monitor.size_px, layer_px=layer_px)
+        for panel, monitor in zip(panels, monitors, strict=True)
+    ]
     root = display.root  # must be the first window
     if draws_in_software(root.gl) if on_processor is None else on_processor:
-        windows = _processor_windows(display, panels, monitors, layer_px, clock)
+        windows = _processor_windows(display, panels, monitors, mounts, layer_px, clock)
         if windows is not None:
             return windows
-    return ShaderWindows(display, panels, monitors, layer_px)
+    return ShaderWindows(display, monitors, mounts)
 
 
 def _processor_windows(
     display: Display,
     panels: Sequence[PanelSettings],
     monitors: Sequence[Monitor],
+    mounts: Sequence[Mount],
     layer_px: tuple[int, int],
     clock: Clock,
 ) -> ProcessorWindows | None:
@@ -284,7 +268,7 @@ def _processor_windows(
         for panel, monitor in zip(panels, monitors, strict=True)
     ]
     try:
-        windows = ProcessorWindows(display, panels, monitors, mountings, clock)
+        windows = ProcessorWindows(display, monitors, mounts, mountings, clock)
     except NotShared as error:
         log.warning("there is no GPU, and %s: drawing will be slow", error)
         display.close_windows()

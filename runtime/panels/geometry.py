@@ -56,12 +56,9 @@ def layer_from_screen(
     """Return the 3x3 matrix that maps monitor pixels to layer pixels, up to scale.
 
     Args:
-        screen_width_px: The monitor's width.
-        screen_height_px: The monitor's height.
         layer_width_px: The layers' width, which may differ from the panel's.
         layer_height_px: The layers' height, which may differ from the panel's.
         rotation_deg: Angle by which the mounted monitor is rotated counter-clockwise, as seen from the front.
-        mirror: How to mirror the picture that the viewer sees: `none`, `horizontal` or `vertical`.
         homography: 3x3 matrix that maps ideal to actual pixels, at the panel's resolution.
 
     Raises:
@@ -103,12 +100,7 @@ DIRECTIONS: dict[Arrow, tuple[int, int]] = {"up": (0, -1), "down": (0, 1), "left
 
 
 def mounting_of(arrow: Arrow, *, mirrored: bool) -> tuple[int, str]:
-    """Determine a panel's `rotation_deg` and `mirror` from how its test card looks.
-
-    Args:
-        arrow: Direction of the arrow on the card, as seen by the viewer.
-        mirrored: True if the text on the card appears mirrored.
-    """
+    """Determine a panel's `rotation_deg` and `mirror` from how its test card looks."""
     mirror = "horizontal" if mirrored else "none"
     rotation_of = {}  # by the direction in which the arrow then points
     for rotation_deg in ROTATIONS:

@@ -58,7 +58,6 @@ def curve(*, lut: str, gamma: float) -> F32:
 
     Args:
         lut: CSV file that contains a measured curve. If empty, the curve follows phase = grey^gamma.
-        gamma: Exponent of the curve, used only if `lut` is empty.
 
     Raises:
         InputError: The file cannot be read or its content is invalid.

@@ -80,10 +80,6 @@ def bind(panels: Sequence[PanelSettings], monitors: Sequence[Monitor]) -> tuple[
     If a panel's settings give both a serial number and a connector, the monitor must match both. The connector is
     needed if several monitors have the same serial number.
 
-    Args:
-        panels: Panel settings, rear to front.
-        monitors: The connected monitors, in any order.
-
     Raises:
         InputError: A panel's settings give neither a serial number nor a connector.
         PanelLost: A panel's monitor is missing, ambiguous, already assigned or mirrored on another panel's. This may

@@ -1,4 +1,4 @@
-"""Use the presentation shader to align a layer, mix it with the flat picture and draw it to a panel."""
+"""Draw the panels' records (optics/presentation.py) using OpenGL."""
 
 from __future__ import annotations
 
@@ -9,9 +9,7 @@ import moderngl
 import numpy as np
 
 from runtime.config import PanelSettings
-from runtime.optics.alignment import is_identity, scale_and_shift
-from runtime.optics.malus import rest_code
-from runtime.optics.relief import displacement
+from runtime.optics.presentation import Mount, PanelDraw, flatness_of
 from runtime.panels import lut
 from runtime.panels.geometry import layer_from_screen, permutes_pixels
 from runtime.records import F32, U8, PanelFrame
@@ -29,26 +27,23 @@ void main() {
 }
 """
 
-# The reference for `shown` is runtime.optics.alignment.shown_layers. Aligned layers are sampled with full-precision
-# weights, because hardware filters round them to steps of 1/256. Outside the layers, the rest value is sampled. If a
-# homography moves the layers, they are sampled once for registration and alignment together, using cubic weights,
-# because bilinear weights would lose another 0.15 dB. Each case has its own program, because a software rasteriser
-# executes both branches of every `if`: a single program for all cases would take several times as long as the slowest
-# of these.
+# The law is that of runtime.optics.presentation, whose records the uniforms hold. Weights have full precision, because
+# hardware filters round them to steps of 1/256. Each case has its own program, because a software rasteriser executes
+# both branches of every `if`: a single program for all cases would take several times as long as the slowest of these.
 FRAGMENT = """
 uniform sampler2D solved;        // this panel's layer of the solution
 uniform sampler2D flat_picture;
 uniform sampler2D curve;
-uniform vec2 size_px;            // size of the panel
-uniform vec2 solved_px;          // size of the solution, which may be coarser
-uniform int extended;            // pixels by which a coarse solution is extended, so that its edge does not fade
-uniform vec4 solved_from_shown;  // scale u, v, shift u, v in pixels of the solution
-uniform sampler2D relief;        // the content's relief on the middle panel
-uniform vec4 middle_from_shown;  // scale u, v, shift u, v in pixels of the panels
-uniform vec3 drift;              // drift right and down, and growth
-uniform float weight_px;
+uniform sampler2D relief;
+uniform vec2 size_px;            // the panel's columns and rows
+uniform vec2 solved_px;          // the solution's
+uniform vec2 relief_px;
+uniform int extended_px;
+uniform vec4 solved_from_shown;  // scale u, v, shift u, v, as in the other maps
+uniform vec4 relief_from_shown;
+uniform vec4 push;
 uniform float flatness;
-uniform float even;
+uniform float rest;
 in vec3 layer_px;
 out vec4 colour;
 #ifdef CURVED
@@ -58,78 +53,55 @@ float grey(float phase, int channel) {
 #else
 float grey(float phase, int channel) { return phase; }
 #endif
-vec3 solved_texel(ivec2 at) {
+vec2 mapped(vec4 by, vec2 px) { return px * by.xy + by.zw; }
+vec3 texel(ivec2 at) {
     ivec2 size = ivec2(solved_px);
-    bool inside = all(greaterThanEqual(at, ivec2(-extended))) && all(lessThan(at, size + extended));
-    return inside ? texelFetch(solved, clamp(at, ivec2(0), size - 1), 0).rgb : vec3(even);
+    bool inside = all(greaterThanEqual(at, ivec2(-extended_px))) && all(lessThan(at, size + extended_px));
+    return inside ? texelFetch(solved, clamp(at, ivec2(0), size - 1), 0).rgb : vec3(rest);
 }
-vec2 solved_at(vec2 px) {  // pixels of the solution
-    vec2 at = px * solved_from_shown.xy + solved_from_shown.zw;
-#ifdef DISPLACED
-    vec2 middle = px * middle_from_shown.xy + middle_from_shown.zw;
-    float b = texture(relief, middle / size_px).r;
-    at += weight_px * b * (drift.xy + drift.z * middle) * solved_px / size_px;
-#endif
-    return at;
-}
-vec3 aligned_at(vec2 px) {
-    vec2 place = clamp(solved_at(px) - 0.5, vec2(-3.0), solved_px + 2.0);
-    vec2 low = floor(place), weight = place - low;
-    ivec2 at = ivec2(low);
-    return mix(mix(solved_texel(at), solved_texel(at + ivec2(1, 0)), weight.x),
-               mix(solved_texel(at + ivec2(0, 1)), solved_texel(at + ivec2(1, 1)), weight.x), weight.y);
-}
-vec4 cubic(float t) {  // weights of four neighbours, as in OpenCV's INTER_CUBIC (a = -3/4)
+vec4 cubic(float t) {  // weights of four neighbours
     vec4 d = vec4(1.0 + t, t, 1.0 - t, 2.0 - t);
     vec4 near = (1.25 * d - 2.25) * d * d + 1.0;
     vec4 far = ((-0.75 * d + 3.75) * d - 6.0) * d + 3.0;
     return vec4(far.x, near.y, near.z, far.w);
 }
-vec3 registered_at(vec2 px) {
-#ifdef ALIGNED
-    vec2 place = solved_at(px) - 0.5;
+vec3 solved_codes(vec2 px) {
+#ifdef COPY
+    return texelFetch(solved, ivec2(floor(px)), 0).rgb;
 #else
-    vec2 place = px - 0.5;
+    vec2 place = mapped(solved_from_shown, px) - 0.5;
+#ifdef DISPLACED
+    place += texture(relief, mapped(relief_from_shown, px) / relief_px).r * mapped(push, px);
 #endif
     place = clamp(place, vec2(-3.0), solved_px + 2.0);
-    vec2 low = floor(place);
-    vec4 across = cubic(place.x - low.x), down = cubic(place.y - low.y);
+    vec2 low = floor(place), weight = place - low;
+    ivec2 at = ivec2(low);
+#ifdef CUBIC
+    vec4 across = cubic(weight.x), down = cubic(weight.y);
     vec3 total = vec3(0.0);
-    for (int j = 0; j < 4; j++) {
-        for (int i = 0; i < 4; i++) {
-            ivec2 at = ivec2(low) + ivec2(i - 1, j - 1);
-#ifdef ALIGNED
-            vec3 texel = solved_texel(at);
-#else
-            vec3 texel = texelFetch(solved, clamp(at, ivec2(0), ivec2(solved_px) - 1), 0).rgb;
-#endif
-            total += across[i] * down[j] * texel;
-        }
-    }
+    for (int j = 0; j < 4; j++)
+        for (int i = 0; i < 4; i++) total += across[i] * down[j] * texel(at + ivec2(i - 1, j - 1));
     return clamp(total, 0.0, 1.0);
-}
-vec3 as_it_is(sampler2D picture, vec2 px) {
-#ifdef EXACT
-    return texelFetch(picture, ivec2(floor(px)), 0).rgb;
 #else
-    return texture(picture, px / size_px).rgb;
+    return mix(mix(texel(at), texel(at + ivec2(1, 0)), weight.x),
+               mix(texel(at + ivec2(0, 1)), texel(at + ivec2(1, 1)), weight.x), weight.y);
+#endif
+#endif
+}
+vec3 flat_codes(vec2 px) {
+#ifdef EXACT
+    return texelFetch(flat_picture, ivec2(floor(px)), 0).rgb;
+#else
+    return texture(flat_picture, px / size_px).rgb;
 #endif
 }
 vec3 shown(vec2 px) {
 #if !defined(SOLVED)
-    return as_it_is(flat_picture, px);
-#elif !defined(EXACT)
-    vec3 phase = registered_at(px);
-#elif defined(ALIGNED)
-    vec3 phase = aligned_at(px);
+    return flat_codes(px);
+#elif defined(MIXED)
+    return mix(solved_codes(px), flat_codes(px), flatness);
 #else
-    vec3 phase = as_it_is(solved, px);
-#endif
-#ifdef SOLVED
-#ifdef MIXED
-    phase = mix(phase, as_it_is(flat_picture, px), flatness);
-#endif
-    return phase;
+    return solved_codes(px);
 #endif
 }
 void main() {
@@ -142,25 +114,30 @@ void main() {
 
 
 Case = tuple[str, ...]  # macros to define in the fragment shader
-CASES: tuple[Case, ...] = (
-    (),
-    *(("SOLVED", *how, *mixed) for how in ((), ("ALIGNED",), ("ALIGNED", "DISPLACED")) for mixed in ((), ("MIXED",))),
-)
+
+
+def case_of(draw: PanelDraw) -> Case:
+    """Return the macros for a record."""
+    solved = (draw.sampling.name, *["DISPLACED"] * (draw.relief is not None), *["MIXED"] * draw.shows_flat)
+    return ("SOLVED", *solved) if draw.shows_solved else ()
+
+
+def cases_of(mount: Mount) -> tuple[Case, ...]:
+    """Return all cases that occur on a monitor."""
+    ways = (("COPY",), ("LINEAR",), ("LINEAR", "DISPLACED")) if mount.is_exact else (("CUBIC",), ("CUBIC", "DISPLACED"))
+    return ((), *(("SOLVED", *way, *mixed) for way in ways for mixed in ((), ("MIXED",))))
+
+
+IDENTITY = np.repeat(np.linspace(0.0, 1.0, lut.ENTRIES, dtype=np.float32)[:, None], 3, axis=1)
 
 
 class FrameTextures:
     """Uploads the latest frame's layers to textures whenever their version changes."""
 
-    def __init__(self, context: moderngl.Context, size_px: tuple[int, int], *, count: int) -> None:
-        """Create an empty set of textures.
-
-        Args:
-            context: GL context that owns the textures.
-            size_px: A panel's width and height.
-            count: Number of panels.
-        """
+    def __init__(self, context: moderngl.Context, *, count: int) -> None:
+        """Create an empty set of textures for `count` panels."""
         self._context = context
-        self.size_px, self.count = size_px, count
+        self.count = count
         self._textures: dict[tuple[str, tuple[int, int]], tuple[moderngl.Texture, ...]] = {}  # keyed by kind and size
         self._solved: tuple[moderngl.Texture, ...] = ()
         self._flat: tuple[moderngl.Texture, ...] = ()
@@ -169,21 +146,16 @@ class FrameTextures:
         self._solved_version: int | None = None
         self._flat_version: int | None = None
 
-    @property
-    def solved_px(self) -> tuple[int, int]:
-        """The uploaded solution's width and height, or a panel's if no solution has been uploaded."""
-        return self._solved[0].size if self._solved else self.size_px
-
     def lacks(self, frame: PanelFrame) -> tuple[bool, bool]:
         """Check which of a frame's pictures must be uploaded before the frame can be drawn.
 
         Returns:
-            Two flags, one for the solution and one for the flat picture. Each is True if that picture is visible in the
-            frame but has not been uploaded.
+            Two flags, for the solution and for the flat picture: True if it is visible, but has not been uploaded.
         """
+        flatness = flatness_of(frame)
         return (
-            shows_solved(frame) and frame.solved_version != self._solved_version,
-            shows_flat(frame) and frame.flat_version != self._flat_version,
+            flatness < 1.0 and frame.solved_version != self._solved_version,
+            flatness > 0.0 and frame.flat_version != self._flat_version,
         )
 
     def upload(self, frame: PanelFrame) -> None:
@@ -240,104 +212,69 @@ class FrameTextures:
         return self._textures[key]
 
 
-def shows_solved(frame: PanelFrame) -> bool:
-    """Return True if the solution is visible in a frame."""
-    return frame.solved is not None and frame.flatness < 1.0
+def mount_of(settings: PanelSettings, *, screen_px: tuple[int, int], layer_px: tuple[int, int]) -> Mount:
+    """Return how a monitor shows its layer.
 
+    Args:
+        screen_px: The monitor's width and height.
+        layer_px: Width and height of each of the stack's panels.
 
-def shows_flat(frame: PanelFrame) -> bool:
-    """Return True if the flat picture is visible in a frame."""
-    return frame.solved is None or frame.flatness > 0.0
+    Raises:
+        InputError: The grey curve's file cannot be read or is invalid.
+        ValueError: The homography is singular or not finite.
+    """
+    matrix = layer_from_screen(
+        screen_width_px=screen_px[0],
+        screen_height_px=screen_px[1],
+        layer_width_px=layer_px[0],
+        layer_height_px=layer_px[1],
+        rotation_deg=settings.rotation_deg,
+        mirror=settings.mirror,
+        homography=settings.homography,
+    )
+    # A homography's sign is arbitrary, but the third coordinate must be positive at the panel's centre.
+    matrix = matrix / (matrix[2] @ np.array([screen_px[0] / 2, screen_px[1] / 2, 1.0]))
+    curved = bool(settings.lut or settings.gamma != 1)
+    curve = lut.curve(lut=settings.lut, gamma=settings.gamma) if curved else None
+    return Mount(screen_px, matrix, permutes_pixels(matrix), curve)
 
 
 class Painter:
-    """Draws frames to one panel using the presentation shader.
+    """Draws one panel's records using the presentation shader.
 
     Each window needs its own painter, because vertex arrays cannot be shared between GL contexts.
     """
 
-    def __init__(
-        self,
-        context: moderngl.Context,
-        settings: PanelSettings,
-        *,
-        screen_px: tuple[int, int],
-        layer_px: tuple[int, int],
-    ) -> None:
-        """Compile the shader for one panel.
-
-        Args:
-            context: The GL context of the panel's window.
-            settings: The panel's settings.
-            screen_px: The monitor's width and height.
-            layer_px: Width and height of each of the stack's panels.
-
-        Raises:
-            InputError: The grey curve's file cannot be read or is invalid.
-            ValueError: The homography is singular or not finite.
-        """
-        self.screen_px = screen_px
-        matrix = layer_from_screen(
-            screen_width_px=screen_px[0],
-            screen_height_px=screen_px[1],
-            layer_width_px=layer_px[0],
-            layer_height_px=layer_px[1],
-            rotation_deg=settings.rotation_deg,
-            mirror=settings.mirror,
-            homography=settings.homography,
-        )
-        # A homography's sign is arbitrary, but the shader needs the third coordinate to be positive at the panel's
-        # centre.
-        matrix = matrix / (matrix[2] @ np.array([screen_px[0] / 2, screen_px[1] / 2, 1.0]))
-        mounting = ["EXACT"] * permutes_pixels(matrix) + ["CURVED"] * bool(settings.lut or settings.gamma != 1)
-        table = np.ascontiguousarray(lut.curve(lut=settings.lut, gamma=settings.gamma).T)
+    def __init__(self, context: moderngl.Context, mount: Mount) -> None:
+        """Compile the shader for one monitor, in its window's context."""
+        self.mount = mount
+        mounting = ["EXACT"] * mount.is_exact + ["CURVED"] * (mount.curve is not None)
+        table = np.ascontiguousarray((IDENTITY if mount.curve is None else mount.curve).T)
         self._curve = context.texture((lut.ENTRIES, 3), 1, table.tobytes(), dtype="f4")
         self._curve.filter = (moderngl.LINEAR, moderngl.LINEAR)
         self._curve.repeat_x = self._curve.repeat_y = False
         fixed = {
             "solved": 0, "flat_picture": 1, "curve": 2, "relief": 3,
-            "screen_px": tuple(map(float, screen_px)), "layer_from_screen": tuple(matrix.T.ravel()),
+            "screen_px": tuple(map(float, mount.screen_px)),
+            "layer_from_screen": tuple(mount.layer_from_screen.T.ravel()),
         }  # fmt: skip
-        self._cases = {case: _compiled(context, (*mounting, *case), fixed) for case in CASES}
+        self._cases = {case: _compiled(context, (*mounting, *case), fixed) for case in cases_of(mount)}
 
-    def draw(self, textures: FrameTextures, frame: PanelFrame, index: int) -> None:
-        """Draw an uploaded frame's picture for one panel to the bound framebuffer.
-
-        Args:
-            textures: Textures that contain the frame's pictures.
-            frame: The frame to draw.
-            index: Panel number, counted from the rear.
-        """
-        matrix = frame.solved_from_shown[index] if frame.solved_from_shown else np.eye(3)
-        (width, height), (solved_width, solved_height) = textures.size_px, textures.solved_px
-        coarse = (width, height) != (solved_width, solved_height)
-        by_u, by_v = solved_width / width, solved_height / height
-        su, sv, tu, tv = scale_and_shift(matrix)
+    def draw(self, textures: FrameTextures, draw: PanelDraw, index: int) -> None:
+        """Draw panel `index` of an uploaded frame to the bound framebuffer."""
+        program, array = self._cases[case_of(draw)]
+        relief_px = (1, 1) if draw.relief is None else draw.relief.shape[::-1]
         values: dict[str, Any] = {
-            "even": rest_code(textures.count) / 255,
-            "size_px": (float(width), float(height)),
-            "solved_px": (float(solved_width), float(solved_height)),
-            "extended": int(coarse),
-            "solved_from_shown": (su * by_u, sv * by_v, tu * by_u, tv * by_v),
-            "flatness": float(frame.flatness),
+            "rest": draw.rest / 255,
+            "size_px": tuple(map(float, draw.size_px)),
+            "solved_px": tuple(map(float, draw.solved_px)),
+            "relief_px": tuple(map(float, relief_px)),
+            "extended_px": draw.extended_px,
+            "solved_from_shown": tuple(draw.solved_from_shown),
+            "relief_from_shown": tuple(draw.relief_from_shown),
+            "push": tuple(draw.push),
+            "flatness": draw.flatness,
         }
-        moved = displacement(frame.relief, frame.parallax, index)
-        if moved is not None:
-            values |= {
-                "middle_from_shown": scale_and_shift(moved.middle_from_shown),
-                "drift": (*moved.drift_px, moved.growth),
-                "weight_px": moved.weight,
-            }
-        case: Case = ()
-        if shows_solved(frame):
-            aligned = coarse or moved is not None or not is_identity(matrix)
-            case = (
-                "SOLVED",
-                *["ALIGNED"] * aligned,
-                *["DISPLACED"] * (moved is not None),
-                *["MIXED"] * shows_flat(frame),
-            )
-        program, array = self._cases[case]
         _set(program, values)
         textures.use(index)
         self._curve.use(2)

@@ -1,9 +1,8 @@
 """Draw the panels' pictures on the processor, for display PCs without a GPU.
 
-A software rasteriser runs the shader of `presentation` for one pixel after another and takes ten times as long. Both
-follow `runtime.optics.alignment.shown_layers`. The pictures are equal to within rounding, except those of coarse
-solutions and of panels with a homography. The latter are interpolated linearly here, where the shader uses cubic
-weights, which are 0.15 dB better.
+A software rasteriser runs the shader of `presentation` for one pixel after another and takes seven to twenty times as
+long. Both follow the records of `runtime.optics.presentation`. Here, registered panels have the sampling `linear`, and
+most coarse solutions are sampled at every other pixel (`COARSE`).
 
 This runs on the presenter's thread. At a refresh, it leaves no work to OpenCV's threads, which have a lower priority,
 and takes Python's global lock as rarely as possible.
@@ -23,14 +22,11 @@ from numpy.typing import NDArray
 
 from runtime.config import PanelSettings
 from runtime.kernels import CURVE_ENTRIES, CURVE_STEPS, ScaleShift, ShownPanel, library
-from runtime.optics.alignment import is_identity, scale_and_shift
 from runtime.optics.malus import rest_code
+from runtime.optics.presentation import Mount, PanelDraw, PixelMap, Sampling, on_layer, panel_draws
 from runtime.optics.rect import PixelRect, union
-from runtime.optics.relief import displacement
 from runtime.optics.stack import between_pixel_centres
-from runtime.panels import lut
 from runtime.panels.geometry import layer_from_screen, panel_from_screen
-from runtime.panels.presentation import shows_flat, shows_solved
 from runtime.panels.shown_part import filled_part, limit
 from runtime.records import F32, F64, U8, PanelFrame
 
@@ -42,6 +38,7 @@ Array = TypeVar("Array", U8, F32)
 
 
 Line = tuple[float, float]  # scale, and shift in pixels, of a map along one axis
+BETWEEN = Sampling.LINEAR  # how to read solutions on registered panels
 
 
 class Axis(NamedTuple):
@@ -55,7 +52,6 @@ class Axis(NamedTuple):
         """Turn a map from layer to picture pixels into one from monitor pixels to the turned picture's.
 
         Args:
-            line: Scale and shift of the map along `layer_axis`.
             size_px: The picture's width and height, as seen by the viewer.
         """
         scale, shift = line
@@ -75,11 +71,6 @@ class Mounting(NamedTuple):
     @classmethod
     def of(cls, settings: PanelSettings, *, screen_px: tuple[int, int], layer_px: tuple[int, int]) -> Mounting:
         """Return a panel's mounting.
-
-        Args:
-            settings: The panel's settings.
-            screen_px: The monitor's width and height.
-            layer_px: Width and height of each of the stack's panels.
 
         Raises:
             ValueError: The homography is singular or not finite.
@@ -137,12 +128,7 @@ class _PictureMemory:
         self.pictures([mounting.turned_px for mounting in mountings], border_px=1)
 
     def pictures(self, sizes_px: list[tuple[int, int]], *, border_px: int) -> tuple[U8, ...]:
-        """Return a picture for each panel, with a border of the rest code around a picture to be filled in.
-
-        Args:
-            sizes_px: Width and height of each panel's picture, without the border.
-            border_px: Width of the border.
-        """
+        """Return a picture for each panel, with a border of the rest code around a picture to be filled in."""
         if self._made_for != (sizes_px, border_px):
             self._made_for = sizes_px, border_px
             self._pictures = tuple(
@@ -164,19 +150,10 @@ class _PictureMemory:
 class ProcessorPainter:
     """Draws frames into pictures in memory, one for each panel."""
 
-    def __init__(self, panels: Sequence[PanelSettings], mountings: Sequence[Mounting], screens: Sequence[U8]) -> None:
-        """Prepare to draw.
-
-        Args:
-            panels: Panel settings, rear to front.
-            mountings: Each panel's mounting.
-            screens: For each panel, the (h, w, 4) picture to draw into, in BGRX order.
-
-        Raises:
-            InputError: A grey curve's file cannot be read or is invalid.
-        """
-        self._mountings, self._screens = mountings, screens
-        self._curves = [_curve_table(panel) if panel.lut or panel.gamma != 1 else None for panel in panels]
+    def __init__(self, mounts: Sequence[Mount], mountings: Sequence[Mounting], screens: Sequence[U8]) -> None:
+        """Prepare to draw into each panel's (h, w, 4) picture, in BGRX order."""
+        self._mounts, self._mountings, self._screens = mounts, mountings, screens
+        self._curves = [None if mount.curve is None else _curve_table(mount.curve) for mount in mounts]
         self._solved: _Pictures | None = None
         self._flat: _Pictures | None = None
         self._solved_memory, self._flat_memory = _PictureMemory(mountings), _PictureMemory(mountings)
@@ -186,12 +163,13 @@ class ProcessorPainter:
 
     def draw(self, frame: PanelFrame) -> dict[int, PixelRect]:
         """Draw a frame, and return the part of each panel's picture that has changed, by the panel's number."""
-        solved = self._prepared_solution(frame) if shows_solved(frame) else None
-        flat = self._prepared_flat(frame) if shows_flat(frame) else None
-        is_moved = not all(map(is_identity, frame.solved_from_shown))
+        draws = panel_draws(frame, self._mounts, between=BETWEEN)
+        solved = self._prepared_solution(frame, draws) if draws[0].shows_solved else None
+        flat = self._prepared_flat(frame) if draws[0].shows_flat else None
+        is_moved = any(draw.moves_solved for draw in draws)
         drawn, filled, parts, to_draw = list(self._drawn), list(self._filled), {}, []
         for panel in range(len(self._screens)):
-            drawn[panel], shown = self._shown(panel, frame, solved, flat, is_moved=is_moved)
+            drawn[panel], shown = self._shown(panel, draws[panel], solved, flat, is_moved=is_moved)
             if drawn[panel] == self._drawn[panel]:
                 continue
             filled[panel] = self._filled_by(panel, shown, solved if flat is None else None)
@@ -209,8 +187,6 @@ class ProcessorPainter:
         """Return the part of a panel's picture outside which it shows the rest code.
 
         Args:
-            panel: The panel's number.
-            shown: Arguments that draw the whole picture.
             solved: The solution, or None if the flat picture is shown or mixed in.
         """
         if solved is None:
@@ -218,20 +194,17 @@ class ProcessorPainter:
         mounting, rise = self._mountings[panel], solved.rises[panel] if shown.relief else 0.0
         return filled_part(shown, solved.boxes[panel], rise=rise, screen_from_panel=mounting.screen_from_turned)
 
-    def _prepared_solution(self, frame: PanelFrame) -> _Pictures:
+    def _prepared_solution(self, frame: PanelFrame, draws: Sequence[PanelDraw]) -> _Pictures:
         assert frame.solved is not None
         if self._solved is None or self._solved.version != frame.solved_version:
             height, width = frame.solved.shape[1:3]
-            coarse = frame.size_px not in (None, (width, height))
-            memory, border_px = self._solved_memory, 2 if coarse else 1
-            pictures, boxes = self._prepared(frame.solved, memory, border_px=border_px, extended=coarse)
+            memory, extended_px = self._solved_memory, [draw.extended_px for draw in draws]
+            border_px = 1 + max(extended_px)
+            pictures, boxes = self._prepared(frame.solved, memory, border_px=border_px, extended_px=extended_px)
             reliefs: tuple[F32, ...] = ()
             rises: tuple[float, ...] = ()
             if frame.relief is not None:
-                reliefs = tuple(
-                    _registered(mounting.on_screen(frame.relief), mounting, screen_px=_size_px(screen), reduced=True)
-                    for mounting, screen in zip(self._mountings, self._screens, strict=True)
-                )
+                reliefs = tuple(np.ascontiguousarray(mounting.on_screen(frame.relief)) for mounting in self._mountings)
                 rises = tuple(float(np.abs(relief).max()) for relief in reliefs)
             self._solved = _Pictures(frame.solved_version, (width, height), border_px, pictures, boxes, reliefs, rises)
         return self._solved
@@ -240,35 +213,26 @@ class ProcessorPainter:
         assert frame.flat is not None
         if self._flat is None or self._flat.version != frame.flat_version:
             size_px = frame.flat.shape[2], frame.flat.shape[1]
-            pictures = tuple(
-                _registered(picture, mounting, screen_px=_size_px(screen))
-                for picture, mounting, screen in zip(
-                    self._prepared(frame.flat, self._flat_memory, border_px=0)[0],
-                    self._mountings,
-                    self._screens,
-                    strict=True,
-                )
-            )
+            turned = self._prepared(frame.flat, self._flat_memory, border_px=0)[0]
+            pictures = tuple(map(_registered, turned, self._mountings, self._mounts, [size_px] * len(turned)))
             self._flat = _Pictures(frame.flat_version, size_px, 0, pictures, tuple(map(_whole, pictures)))
         return self._flat
 
     def _prepared(
-        self, layers: U8, memory: _PictureMemory, *, border_px: int, extended: bool = False
+        self, layers: U8, memory: _PictureMemory, *, border_px: int, extended_px: Sequence[int] = ()
     ) -> tuple[tuple[U8, ...], tuple[PixelRect, ...]]:
         """Turn layers for the monitors, and surround them with the rest code.
 
         Args:
-            layers: (N, h, w, 4) RGBA layers.
             memory: Memory for the pictures, which replace those last prepared there.
-            border_px: Width of the border.
-            extended: True to repeat the layers' edge pixels in the innermost pixel of the border.
+            extended_px: For each panel, the innermost pixels of the border in which the layer's edge is repeated.
 
         Returns:
             The pictures, and in each the box of the pixels that differ from the rest code.
         """
         turned = [mounting.on_screen(layer) for layer, mounting in zip(layers, self._mountings, strict=True)]
         pictures, boxes = memory.pictures([_size_px(layer) for layer in turned], border_px=border_px), []
-        for picture, layer in zip(pictures, turned, strict=True):
+        for picture, layer, extended in zip(pictures, turned, extended_px or [0] * len(turned), strict=True):
             rows, columns = layer.shape[:2]
             box = (ctypes.c_int32 * 4)()
             library().frame_picture(
@@ -278,7 +242,7 @@ class ProcessorPainter:
         return pictures, tuple(boxes)
 
     def _shown(
-        self, panel: int, frame: PanelFrame, solved: _Pictures | None, flat: _Pictures | None, *, is_moved: bool
+        self, panel: int, draw: PanelDraw, solved: _Pictures | None, flat: _Pictures | None, *, is_moved: bool
     ) -> tuple[object, ShownPanel]:
         """Return a key that identifies the panel's picture, and the arguments that draw it."""
         screen, curve = self._screens[panel], self._curves[panel]
@@ -299,7 +263,7 @@ class ProcessorPainter:
         if solved is None:
             shown.source_from_panel = ScaleShift(1.0, 1.0, -0.5, -0.5)
             return ("flat", source.version), shown
-        maps = self._maps(panel, frame, solved)
+        maps = self._maps(panel, draw, solved)
         shown.source_from_panel = ScaleShift(*maps[0])
         mounting = self._mountings[panel]
         if mounting.turned_from_screen is not None:
@@ -310,42 +274,38 @@ class ProcessorPainter:
             shown.relief, (shown.relief_rows, shown.relief_columns) = relief.ctypes.data, relief.shape
             shown.relief_from_screen, shown.push = ScaleShift(*maps[1]), ScaleShift(*maps[2])
         if flat is None:
-            coarse = (frame.size_px or solved.size_px)[0] >= COARSE * solved.size_px[0]
-            if coarse and is_moved:
+            if is_moved and draw.size_px[0] >= COARSE * draw.solved_px[0]:
                 shown.every = 2
             return (solved.version, *maps), shown
         other = flat.pictures[panel]
-        shown.flat, shown.flat_stride, shown.flatness = other.ctypes.data, other.strides[0], frame.flatness
-        return (solved.version, *maps, flat.version, frame.flatness), shown
+        shown.flat, shown.flat_stride, shown.flatness = other.ctypes.data, other.strides[0], draw.flatness
+        return (solved.version, *maps, flat.version, draw.flatness), shown
 
-    def _maps(self, panel: int, frame: PanelFrame, solved: _Pictures) -> list[tuple[float, float, float, float]]:
-        """Return scales and shifts (scale_u, scale_v, shift_u, shift_v) from the turned layer's pixels.
+    def _maps(self, panel: int, draw: PanelDraw, solved: _Pictures) -> list[tuple[float, float, float, float]]:
+        """Return a record's maps (scale_u, scale_v, shift_u, shift_v) for the turned layer's pixels.
 
-        The first leads to positions in the source. If the content's relief displaces them, two follow: from the
-        monitor's pixels to positions in the relief, and to the displacement by a relief of 1. Positions count from the
-        centre of a picture's top left pixel.
+        The first leads to positions in the source. If the content's relief displaces them, two follow: to positions in
+        the relief, and to the displacement by a relief of 1. Positions count from the centre of a picture's top left
+        pixel.
         """
-        size_px = frame.size_px or solved.size_px
-        aligned = scale_and_shift(frame.solved_from_shown[panel]) if frame.solved_from_shown else (1.0, 1.0, 0.0, 0.0)
-        moved = displacement(frame.relief, frame.parallax, panel)
         along: list[list[Line]] = [[], [], []]  # for each map, across and down; plain floats, because arrays are slow
-        mounting, screen_px = self._mountings[panel], _size_px(self._screens[panel])
-        for n, axis in enumerate((mounting.across, mounting.down)):
+        mounting = self._mountings[panel]
+        for axis in (mounting.across, mounting.down):
             to = axis.layer_axis
-            coarser = solved.size_px[to] / size_px[to]
-            scale, shift = axis.turned((coarser * aligned[to], coarser * aligned[2 + to]), solved.size_px)
+            scale, shift = axis.turned(_along(draw.solved_from_shown, to), solved.size_px)
             along[0].append((scale, shift + solved.border_px - 0.5))
-            if moved is None:
+            if draw.relief is None:
                 continue
-            middle = scale_and_shift(moved.middle_from_shown)
-            relief_px = moved.relief.shape[1], moved.relief.shape[0]
-            share = relief_px[to] / size_px[to]
-            scale, shift = axis.turned((share * middle[to], share * middle[2 + to]), relief_px)
-            along[1].append((scale * mounting.turned_px[n] / screen_px[n], shift - 0.5))
-            by = moved.weight * coarser
-            at_edge = moved.drift_px[to] + moved.growth * (middle[to] * axis.offset_px + middle[2 + to])
-            along[2].append((by * moved.growth * middle[to], axis.sign * by * at_edge))
+            scale, shift = axis.turned(_along(draw.relief_from_shown, to), (draw.relief.shape[1], draw.relief.shape[0]))
+            along[1].append((scale, shift - 0.5))
+            scale, shift = _along(draw.push, to)
+            along[2].append((scale, axis.sign * (scale * axis.offset_px + shift)))
         return [(across[0], down[0], across[1], down[1]) for across, down in filter(None, along)]
+
+
+def _along(by: PixelMap, axis: int) -> Line:
+    """Return a map's scale and shift along an axis of the layer."""
+    return by[axis], by[2 + axis]
 
 
 def _whole(picture: U8) -> PixelRect:
@@ -357,35 +317,23 @@ def _size_px(picture: U8 | F32) -> tuple[int, int]:
     return picture.shape[1], picture.shape[0]
 
 
-def _registered(picture: Array, mounting: Mounting, *, screen_px: tuple[int, int], reduced: bool = False) -> Array:
-    """Resample a turned picture for a monitor, if the monitor's pixels do not coincide with the picture's.
-
-    Args:
-        picture: Picture (h, w) or (h, w, 4), of the turned layer's size unless it is reduced.
-        mounting: The panel's mounting.
-        screen_px: The monitor's width and height.
-        reduced: True if the picture is smaller than the layer. It keeps its size, and its edge is repeated outwards.
-    """
+def _registered(picture: U8, mounting: Mounting, mount: Mount, layer_px: tuple[int, int]) -> U8:
+    """Resample a turned (h, w, 4) picture for a monitor, if the monitor's pixels do not coincide with the picture's."""
+    picture = np.ascontiguousarray(picture)
     if mounting.turned_from_screen is None:
-        return np.ascontiguousarray(picture)
-    matrix, (width, height), border = mounting.turned_from_screen, screen_px, cv2.BORDER_CONSTANT
-    if reduced:
-        (width, height), border = _size_px(picture), cv2.BORDER_REPLICATE
-        reduced_from_turned = np.diag(np.array([width / mounting.turned_px[0], height / mounting.turned_px[1], 1.0]))
-        screen_from_reduced = np.diag(np.array([screen_px[0] / width, screen_px[1] / height, 1.0]))
-        matrix = reduced_from_turned @ matrix @ screen_from_reduced
-    matrix, picture = between_pixel_centres(matrix), np.ascontiguousarray(picture)
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    warped = cv2.warpPerspective(picture, matrix, (width, height), flags=flags, borderMode=border)
-    return np.asarray(warped, picture.dtype)
+        return picture
+    matrix, flags = between_pixel_centres(mounting.turned_from_screen), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    warped = cv2.warpPerspective(picture, matrix, mount.screen_px, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    columns, rows = (np.arange(count) + 0.5 for count in mount.screen_px)
+    warped[~on_layer(mount, columns[None], rows[:, None], layer_px)[2]] = 0
+    return np.asarray(warped, np.uint8)
 
 
-def _curve_table(settings: PanelSettings) -> NDArray[np.uint32]:
-    """Return a panel's grey curve, (3, CURVE_ENTRIES) pixels, by channel (blue, green, red) and quarters of a code.
+def _curve_table(coarse: F32) -> NDArray[np.uint32]:
+    """Return a grey curve as (3, CURVE_ENTRIES) pixels, by channel (blue, green, red) and quarters of a code.
 
     Each pixel has only the channel's byte. The sum of one for each channel is a pixel to display.
     """
-    coarse = lut.curve(lut=settings.lut, gamma=settings.gamma)
     codes = np.arange(CURVE_ENTRIES) / CURVE_STEPS
-    greys = np.array([np.interp(codes, np.arange(lut.ENTRIES), coarse[:, channel]) for channel in (2, 1, 0)])
+    greys = np.array([np.interp(codes, np.arange(len(coarse)), coarse[:, channel]) for channel in (2, 1, 0)])
     return np.asarray(np.rint(255.0 * greys), np.uint32) << np.array([[0], [8], [16]], np.uint32)

@@ -55,9 +55,6 @@ def open_panels(settings: OutputSettings, stack: PanelStack, clock: Clock, conte
     """Open the output described by the `[output]` section of the settings.
 
     Args:
-        settings: The `[output]` section of the settings.
-        stack: The display's panels.
-        clock: The run's clock.
         context: The content's GL context. The output makes it current again at the end of each call.
 
     Raises:

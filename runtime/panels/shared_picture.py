@@ -102,10 +102,7 @@ class SharedPicture:
         """Create a black picture.
 
         Args:
-            display: Pointer to an open Xlib `Display`.
             window: The window's identifier. The window must have the screen's default visual.
-            width_px: The window's width.
-            height_px: The window's height.
 
         Raises:
             NotShared: Memory cannot be shared with the X server, or its pixels are not 32-bit BGRX.
@@ -201,18 +198,10 @@ class SharedPicture:
 
 
 def finish(display: int) -> None:
-    """Wait until the X server has carried out every request.
-
-    Args:
-        display: Pointer to an open Xlib `Display`.
-    """
+    """Wait until the X server has carried out every request."""
     _libraries()[0].XSync(display, 0)
 
 
 def flush(display: int) -> None:
-    """Send all requests to the X server without waiting for them.
-
-    Args:
-        display: Pointer to an open Xlib `Display`.
-    """
+    """Send all requests to the X server without waiting for them."""
     _short_calls()[0].XFlush(display)

@@ -22,7 +22,6 @@ def filled_part(shown: ShownPanel, box: PixelRect, *, rise: float = 0.0, screen_
     """Return the part of the screen that shows part of a layer.
 
     Args:
-        shown: Arguments that draw the whole picture.
         box: The part of the layer, in pixels of `shown.source`.
         rise: Largest absolute value of the relief.
         screen_from_panel: 3x3 homography from the panel's pixels to the screen's, or None if they coincide.
@@ -55,7 +54,6 @@ def limit(shown: ShownPanel, part: PixelRect) -> None:
     u, v = part.u0, part.v0
     shown.screen += v * shown.screen_stride + 4 * u
     shown.columns, shown.rows = part.width_px, part.height_px
-    _move(shown.relief_from_screen, u, v)
     if shown.registered:
         h = shown.panel_from_screen
         for row in (0, 3, 6):
@@ -63,6 +61,7 @@ def limit(shown: ShownPanel, part: PixelRect) -> None:
     else:
         _move(shown.source_from_panel, u, v)
         _move(shown.push, u, v)
+        _move(shown.relief_from_screen, u, v)
 
 
 def _reached(first: int, end: int, scale: float, shift: float, push: float) -> tuple[float, float]:

@@ -54,10 +54,6 @@ class WindowPanels(PanelSink):
         """Open a window for each panel.
 
         Args:
-            panels: Panel settings, rear to front.
-            stack: The display's panels.
-            clock: The run's clock.
-            content: The content's GL context.
             any_shape: True to accept monitors whose resolution differs from the stack's and to fill them, for
                 `identify`.
             on_processor: True to draw on the processor if that is possible, False to draw by OpenGL, or None to draw on

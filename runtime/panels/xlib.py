@@ -200,7 +200,6 @@ def output_state(display: int, output: int) -> OutputState | None:
 
     Args:
         display: Pointer to an Xlib `Display`.
-        output: The output's RandR identifier.
     """
     x11, randr = _libraries()
     resources = randr.XRRGetScreenResourcesCurrent(display, x11.XDefaultRootWindow(display))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict, replace
@@ -134,7 +133,7 @@ def plan_for(config: Path | None, *, scene: str | None, model: str | None, scale
         predictor.set_backend(backend)
         measured = measure(predictor, content, eyes_m, fov_deg=settings.content.fov_deg)
         numbers = measured.numbers
-        planned = make_plan(content.info, settings, eyes_m=eyes_m, measured=numbers, loaded_modules=sys.modules)
+        planned = make_plan(content.info, settings, eyes_m=eyes_m, measured=numbers)
         reused = settings.plan.enabled and not content.info.moving
         drift_db = numbers.reuse.costs_db if reused else None
         return {

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,14 +10,6 @@ from runtime.config import Settings
 from runtime.content.base import ContentInfo
 from runtime.model.job import Savings
 from runtime.records import F64, PlanItem
-
-OPTIONAL_PARTS = {
-    "torch": "training",
-    "openni": "the depth camera's SDK",
-    "usb": "USB sensors",
-    "trimesh": "meshes",
-    "matplotlib": "reports",
-}
 
 VISIBLE_DEG = 80.0  # an eye farther than this from the display's axis cannot see the display
 RETURN_MARGIN_DEG = 3.0  # three standard deviations of an eye's direction at 0.2 m with 3 mm of noise
@@ -103,7 +94,6 @@ def make_plan(
     eyes_m: F64 | None = None,
     seeing: tuple[bool, bool] | None = None,
     measured: Measured | None = None,
-    loaded_modules: Collection[str] = (),
 ) -> Plan:
     """Return the plan for a scene and a viewer. It is valid until the scene or the viewer changes.
 
@@ -112,8 +102,6 @@ def make_plan(
         seeing: For the left and the right eye, True if the eye can see the display (`seeing_eyes`). If None, this is
             computed from `eyes_m`.
         measured: Effects of the savings, to be quoted in the items.
-        loaded_modules: Names of the modules imported so far (`sys.modules`). The plan lists the optional parts that are
-            not among them.
     """
     on, numbers = settings.plan.enabled, measured or Measured()
     if seeing is None and eyes_m is not None:
@@ -133,12 +121,6 @@ def make_plan(
         )
     if settings.sensor.driver == "fixed":
         items.append(_item("the sensor", "the eye positions are fixed because sensor.driver is `fixed`", Saving()))
-    absent = [name for name in OPTIONAL_PARTS if name not in loaded_modules]
-    if absent:
-        why = "these modules are not needed and were not imported: " + ", ".join(
-            f"{name} ({OPTIONAL_PARTS[name]})" for name in absent
-        )
-        items.append(_item("optional parts", why, Saving()))
     return Plan(seeing, tuple(items))
 
 

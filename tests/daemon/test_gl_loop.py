@@ -16,7 +16,7 @@ from runtime.clock import NS_PER_S
 from runtime.config import Settings
 from runtime.daemon.solver_parts import SolverMaker
 from runtime.eyes.calibration import load_calibration
-from runtime.optics.alignment import shown_layers
+from runtime.optics.presentation import shown_layers
 from runtime.optics.stack import PanelStack
 from runtime.panels.display import glfw
 from runtime.records import SolveRequest

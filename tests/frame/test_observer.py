@@ -20,8 +20,9 @@ from runtime.frame.presenter import Refresh
 from runtime.frame.solver_host import Task
 from runtime.frame.targets import TargetDrawer
 from runtime.model.predictor import Predictor
-from runtime.optics.alignment import align, shown_layers
+from runtime.optics.alignment import align
 from runtime.optics.carried import carried_db, expected_psnrs_db
+from runtime.optics.presentation import shown_layers
 from runtime.plan.drawing import drawn_job, retina_pictures
 from runtime.records import PanelFrame, RefreshAccount, SensorFrame, Solution, State
 from runtime.support.background import wait_for_all

@@ -103,7 +103,7 @@ def test_an_eye_that_the_solution_was_not_made_for_moves_nothing(stage: Stage) -
 
 def test_at_rest_codes_ignore_noise_and_with_movement_they_change() -> None:
     """A 60 Hz head with 3 mm of noise does not shimmer."""
-    from runtime.optics.alignment import shown_layers
+    from runtime.optics.presentation import shown_layers
 
     random = np.random.default_rng(3)
     textured = random.integers(0, 256, (STACK.count, STACK.height_px, STACK.width_px, 4)).astype(np.uint8)

@@ -16,7 +16,7 @@ from runtime.config import OutputSettings, Settings
 from runtime.daemon.build import Host, Run, RunOptions
 from runtime.daemon.drive import drive
 from runtime.frame.presenter import Presenter, Refresh
-from runtime.optics.alignment import scale_and_shift, shown_layers
+from runtime.optics.presentation import scale_and_shift, shown_layers
 from runtime.optics.stack import PanelStack
 from runtime.panels.registry import panel_settings
 from runtime.records import U8, SensorFrame

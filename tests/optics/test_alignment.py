@@ -11,17 +11,9 @@ from hypothesis import assume, example, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from runtime.optics.alignment import (
-    FARTHEST_M,
-    MOST_SCALE,
-    MOST_SHIFT,
-    Alignment,
-    align,
-    is_identity,
-    reference_plane,
-    shown_layers,
-)
+from runtime.optics.alignment import FARTHEST_M, MOST_SCALE, MOST_SHIFT, Alignment, align, reference_plane
 from runtime.optics.malus import intensity_from_phase
+from runtime.optics.presentation import shown_layers
 from runtime.optics.stack import PanelStack
 from runtime.records import PanelFrame
 from tests.optics import reference
@@ -152,11 +144,11 @@ def test_eyes_that_are_nowhere_leave_the_layers_as_they_are(bad: float) -> None:
     new = HEAD.copy()
     new[1, 2] = bad
     aligned = align(STACK, solved_for_m=HEAD, eyes_m=new)
-    assert all(is_identity(matrix) for matrix in aligned.solved_from_shown)
+    assert all(np.array_equal(matrix, np.eye(3)) for matrix in aligned.solved_from_shown)
     assert "not finite" in aligned.limited
     assert "not finite" in align(STACK, solved_for_m=new, eyes_m=HEAD).limited
     behind = align(STACK, solved_for_m=HEAD - np.array([0.7, 0.0, 0.0]), eyes_m=HEAD)
-    assert all(is_identity(matrix) for matrix in behind.solved_from_shown) and behind.limited
+    assert all(np.array_equal(matrix, np.eye(3)) for matrix in behind.solved_from_shown) and behind.limited
 
 
 @pytest.mark.parametrize("x_m", [-1.0, 0.0, 0.06, 0.069])

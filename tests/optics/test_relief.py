@@ -14,8 +14,9 @@ from runtime.config import Settings, with_options
 from runtime.content.registry import open_content
 from runtime.evaluation.refresh_quality import live_error
 from runtime.model.predictor import load_predictor
-from runtime.optics.alignment import align, shown_layers
-from runtime.optics.relief import RIM_PX, displacement, parallax, relief_of
+from runtime.optics.alignment import align
+from runtime.optics.presentation import displacement, shown_layers
+from runtime.optics.relief import RIM_PX, parallax, relief_of
 from runtime.optics.stack import PanelStack
 from runtime.plan.drawing import drawn_job, retina_pictures
 from runtime.records import F64, PanelFrame
@@ -55,9 +56,7 @@ def test_a_point_is_found_where_the_old_middle_saw_it(
     aligned = align(STACK, solved_for_m=np.stack([old_m] * 2), eyes_m=np.stack([new_m] * 2))
     for panel in range(3):
         shown = on_panel(panel, new_m, point_m)
-        shift = displacement(relief, moved, panel)
-        assert shift is not None
-        right, down = shift.at(shown[:1], shown[1:], size_px=(480, 270))
+        right, down = displacement(moved, panel, relief, (480, 270), shown[:1], shown[1:])
         matrix = aligned.solved_from_shown[panel]
         found = shown * np.diag(matrix)[:2] + matrix[:2, 2] + np.array([right.item(), down.item()])
         if not aligned.limited:

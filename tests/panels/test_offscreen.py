@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 
 from runtime.clock import SimulatedClock
 from runtime.config import PanelSettings
-from runtime.optics.alignment import align, shown_layers
+from runtime.optics.alignment import align
+from runtime.optics.presentation import shown_layers
 from runtime.optics.stack import PanelStack
+from runtime.panels.presentation import mount_of
 from runtime.panels.processor import Mounting, ProcessorPainter
 from runtime.records import U8, PanelFrame
 from tests.panels.drawn import DrawnPanels, ProcessorDrawnPanels
@@ -346,7 +348,8 @@ def test_layers_are_enlarged_for_a_larger_monitor(context: moderngl.Context | No
     settings = PanelSettings()
     if context is None:
         painter = ProcessorPainter(
-            [settings], [Mounting.of(settings, screen_px=screen_px, layer_px=size_px)],
+            [mount_of(settings, screen_px=screen_px, layer_px=size_px)],
+            [Mounting.of(settings, screen_px=screen_px, layer_px=size_px)],
             screens := [np.zeros((*screen_px[::-1], 4), np.uint8)],
         )  # fmt: skip
         painter.draw(PanelFrame(1, layer[None], 1))

@@ -13,6 +13,7 @@ from runtime.optics.alignment import align
 from runtime.optics.malus import rest_code
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
+from runtime.panels.presentation import mount_of
 from runtime.panels.processor import Mounting, ProcessorPainter
 from runtime.records import F64, U8, PanelFrame
 
@@ -33,7 +34,8 @@ def painter(settings: PanelSettings) -> tuple[ProcessorPainter, list[U8]]:
     screen_px = (HEIGHT, WIDTH) if settings.rotation_deg == 90 else (WIDTH, HEIGHT)
     mounting = Mounting.of(settings, screen_px=screen_px, layer_px=(WIDTH, HEIGHT))
     screens = [np.zeros((*screen_px[::-1], 4), np.uint8) for _ in range(3)]
-    return ProcessorPainter((settings,) * 3, (mounting,) * 3, screens), screens
+    mount = mount_of(settings, screen_px=screen_px, layer_px=(WIDTH, HEIGHT))
+    return ProcessorPainter((mount,) * 3, (mounting,) * 3, screens), screens
 
 
 def sparse_layers(box: PixelRect, seed: int, *, coarser: int) -> U8:

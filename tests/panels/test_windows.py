@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from runtime.config import PanelSettings
 from runtime.errors import PanelLost
-from runtime.optics.alignment import align, shown_layers
+from runtime.optics.alignment import align
+from runtime.optics.presentation import shown_layers
 from runtime.optics.stack import PanelStack
 from runtime.panels import drawing
 from runtime.panels.display import glfw

@@ -58,12 +58,6 @@ def test_a_given_eye_position_needs_no_sensor() -> None:
     assert "the sensor" not in names(planned())
 
 
-def test_what_is_not_imported_is_said() -> None:
-    (item,) = [item for item in planned(loaded_modules={"torch"}).items if item.what == "optional parts"]
-    assert "torch" not in item.why
-    assert "trimesh" in item.why
-
-
 def at_angle(degrees: float) -> np.ndarray:
     """Eyes whose right one is off the axis by this much, at 0.5 m."""
     angle = np.radians(degrees)

@@ -139,29 +139,43 @@ function parallax(stack, old, now) {
 
 export const unaligned = (stack) => ({ maps: stack.x_m.map(() => [1, 1, 0, 0]), limited: "", parallax: null });
 
+// Return what the panels show, for `Display.show`. Twin of panel_draws in runtime/optics/presentation.py, which defines
+// the fields; maps and pushes are [scale u, scale v, shift u, shift v] for each panel. Positions in the relief are
+// fractions of its size.
+export function panelDraws(stack, { maps, parallax }, solved_px, flatness = 0) {
+  const size_px = [stack.width_px, stack.height_px], coarser = solved_px.map((px, k) => px / size_px[k]);
+  const still = { drift: [0, 0, 0], middles: maps, weights: maps.map(() => 0) }, { drift: [right, down, growth], middles, weights } = parallax ?? still;
+  const by = ([su, sv, tu, tv], [u, v]) => [su * u, sv * v, tu * u, tv * v];
+  return {
+    size_px, solved_px, flatness, rest: stack.rest_code, extended_px: +coarser.some((by) => by !== 1),
+    solved_from_shown: maps.map((map) => by(map, coarser)),
+    relief_from_shown: middles.map((map) => by(map, size_px.map((px) => 1 / px))),
+    push: middles.map(([su, sv, tu, tv], n) => by([growth * su, growth * sv, right + growth * tu, down + growth * tv], coarser.map((by) => weights[n] * by))),
+  };
+}
+
 const VERTEX = `#version 300 es
 void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0); }`;
 
-// Position of a shown pixel in the solution, in solution pixels, which may be coarser than the panels' pixels. If the
-// relief is unknown, it is 0 everywhere.
+// Position of a shown pixel in the solution, in its pixels: (P1) in runtime/optics/presentation.py. If the relief is
+// unknown, it is 0 everywhere.
 const SOLVED_AT = `precision highp float; precision highp sampler2D; precision highp sampler2DArray;
 const int PANELS = @PANELS@;
-uniform sampler2D relief; uniform vec4 maps[PANELS], middles[PANELS]; uniform float weights[PANELS], rest; uniform vec3 drift;
-uniform vec2 size, solved_px;
+uniform sampler2D relief; uniform vec4 solved_from_shown[PANELS], relief_from_shown[PANELS], push[PANELS]; uniform float rest;
+uniform vec2 size_px, solved_px;
+vec2 mapped(vec4 by, vec2 px) { return px * by.xy + by.zw; }
 vec2 solved_at(int n, vec2 px) {
-  vec2 middle = px * middles[n].xy + middles[n].zw;
-  float b = weights[n] * texture(relief, middle / size).r;
-  return (px * maps[n].xy + maps[n].zw + b * (drift.xy + drift.z * middle)) * solved_px / size;
+  return mapped(solved_from_shown[n], px) + texture(relief, mapped(relief_from_shown[n], px)).r * mapped(push[n], px);
 }`;
 
 // A layer as shown by its panel: aligned, mixed with the flat picture, and rounded to 8 bits by the framebuffer.
 const SHOW = `#version 300 es
 ${SOLVED_AT}
-uniform sampler2DArray layers, flat_picture; uniform int panel, extended; uniform float flatness;
+uniform sampler2DArray layers, flat_picture; uniform int panel, extended_px; uniform float flatness;
 out vec4 colour;
 vec3 texel(ivec2 at) { // a coarse solution is extended by a pixel, so that its edge does not fade
   ivec2 end = ivec2(solved_px);
-  bool inside = all(greaterThanEqual(at, ivec2(-extended))) && all(lessThan(at, end + extended));
+  bool inside = all(greaterThanEqual(at, ivec2(-extended_px))) && all(lessThan(at, end + extended_px));
   return inside ? texelFetch(layers, ivec3(clamp(at, ivec2(0), end - 1), panel), 0).rgb : vec3(rest);
 }
 void main() {
@@ -173,18 +187,18 @@ void main() {
   colour = vec4(code, 1.0);
 }`;
 
-// A draft of an eye's picture, with one ray per pixel through the interpolated solution. The relief is read at the
-// point where the ray crosses the middle panel. A draft takes a tenth of the time needed to draw and trace the panels.
+// A draft of an eye's picture, with one ray per pixel through the interpolated solution. A draft takes a tenth of the time
+// needed to draw and trace the panels.
 const QUICK = `#version 300 es
 ${SOLVED_AT}
 uniform sampler2DArray layers; uniform mat3 into[PANELS]; uniform vec2 origin; uniform vec3 room;
 out vec4 colour;
 void main() {
-  vec3 p = vec3(gl_FragCoord.x - origin.x, origin.y - gl_FragCoord.y, 1.0), h = into[PANELS / 2] * p, sum = vec3(0.0);
-  vec2 px = h.xy / h.z, off = texture(relief, px / size).r * (drift.xy + drift.z * px), at;
+  vec3 p = vec3(gl_FragCoord.x - origin.x, origin.y - gl_FragCoord.y, 1.0), h, sum = vec3(0.0);
+  vec2 px, at;
   bool seen = true;
-#define THROUGH(n) h = into[n] * p; px = h.xy / h.z; at = (px * maps[n].xy + maps[n].zw + weights[n] * off) / size; \\
-  seen = seen && h.z > 0.0 && all(greaterThanEqual(px, vec2(0.0))) && all(lessThan(px, size)); \\
+#define THROUGH(n) h = into[n] * p; px = h.xy / h.z; at = solved_at(n, px) / solved_px; \\
+  seen = seen && h.z > 0.0 && all(greaterThanEqual(px, vec2(0.0))) && all(lessThan(px, size_px)); \\
   sum += clamp(at, 0.0, 1.0) == at ? texture(layers, vec3(at, n)).rgb : vec3(rest);
   @EACH@
   vec3 s = sin(sum * 1.5707963267948966);
@@ -317,7 +331,7 @@ export class Display {
     this.unfold(null);
     this.targets = [null, null];
     this.framebuffer = g.createFramebuffer();
-    this.drawn = null; // alignment and flatness used to draw `shown`; null if it must be drawn again
+    this.drawn = null; // what `shown` was drawn from; null if it must be drawn again
   }
 
   #layers(width, height) {
@@ -386,17 +400,15 @@ export class Display {
     this.drawn = null;
   }
 
-  // Set a program's uniforms for the solution's position on each panel.
-  #align(places, { maps, parallax }) {
-    const g = this.g, { width_px: w, height_px: h } = this.stack, still = { drift: [0, 0, 0], middles: maps, weights: maps.map(() => 0) };
-    const { drift, middles, weights } = parallax ?? still;
-    g.uniform4fv(places.maps, maps.flat());
-    g.uniform4fv(places.middles, middles.flat());
-    g.uniform1fv(places.weights, weights);
-    g.uniform3f(places.drift, ...drift);
-    g.uniform1f(places.rest, this.stack.rest_code / 255); // value used outside a shifted solution
-    g.uniform2f(places.size, w, h);
-    g.uniform2f(places.solved_px, ...this.solved_px);
+  // Set a program's uniforms from the result of `panelDraws`.
+  #set(places, draws) {
+    const g = this.g;
+    for (const name of ["solved_from_shown", "relief_from_shown", "push"]) g.uniform4fv(places[name], draws[name].flat());
+    g.uniform1f(places.rest, draws.rest / 255);
+    g.uniform2f(places.size_px, ...draws.size_px);
+    g.uniform2f(places.solved_px, ...draws.solved_px);
+    g.uniform1i(places.extended_px ?? null, draws.extended_px);
+    g.uniform1f(places.flatness ?? null, draws.flatness);
     g.activeTexture(g.TEXTURE2);
     g.bindTexture(g.TEXTURE_2D, this.relief);
     g.uniform1i(places.relief, 2);
@@ -416,20 +428,18 @@ export class Display {
     g.texParameteri(g.TEXTURE_2D, g.TEXTURE_MIN_FILTER, g.LINEAR_MIPMAP_LINEAR);
   }
 
-  // Draw the panels, showing the aligned solution mixed with the flat picture.
-  show(aligned, flatness = 0) {
-    const g = this.g, key = JSON.stringify([aligned, flatness]);
+  // Draw the panels from the result of `panelDraws`.
+  show(draws) {
+    const g = this.g, key = JSON.stringify(draws);
     if (key === this.drawn) return;
-    const { width_px: w, height_px: h } = this.stack, places = this.#use("show", "solved");
-    this.#align(places, aligned);
+    const [w, h] = draws.size_px, places = this.#use("show", "solved");
+    this.#set(places, draws);
     g.activeTexture(g.TEXTURE1);
     g.bindTexture(g.TEXTURE_2D_ARRAY, this.textures.flat);
     g.uniform1i(places.flat_picture, 1);
-    g.uniform1i(places.extended, this.solved_px[0] !== w || this.solved_px[1] !== h);
-    g.uniform1f(places.flatness, flatness);
     g.bindFramebuffer(g.FRAMEBUFFER, this.framebuffer);
     g.viewport(0, 0, w, h);
-    aligned.maps.forEach((_, n) => {
+    draws.push.forEach((_, n) => {
       g.framebufferTextureLayer(g.FRAMEBUFFER, g.COLOR_ATTACHMENT0, this.textures.shown, 0, n);
       g.uniform1i(places.panel, n);
       g.drawArrays(g.TRIANGLES, 0, 3);
@@ -441,7 +451,7 @@ export class Display {
   // Draw one eye's picture into part of the bound framebuffer.
   // nominal: eye whose picture is treated as if painted on the centre panel.
   // part: [x, y, width, height]; y is measured from the bottom.
-  // quick: alignment used to sample the solution directly, or null to trace the panels drawn by `show`.
+  // quick: what to sample the solution directly by (`panelDraws`), or null to trace the panels drawn by `show`.
   // rays: number of rays per pixel in each direction, or 0 for the exact picture.
   // gain: 0 draws the picture, 1 draws the target, and larger values draw the difference from the target, multiplied by
   // `gain`.
@@ -458,7 +468,7 @@ export class Display {
     g.uniformMatrix3fv(places.into, false, columns);
     g.uniform2f(places.origin, part[0], part[1] + part[3]);
     g.uniform3f(places.room, ...room);
-    if (quick) this.#align(places, quick);
+    if (quick) this.#set(places, quick);
     else {
       g.uniform2fv(places.per_metre, apart);
       const points = [0, 0], radius = pupil_mm / 2000;

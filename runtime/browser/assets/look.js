@@ -1,6 +1,6 @@
 // User interface for a page that shows a display: the head is moved with the pointer or keys, and there are viewing
 // modes and figures.
-import { Display, alignment, unaligned, drawPlan, middle, moved, reach } from "/display.js";
+import { Display, alignment, unaligned, panelDraws, drawPlan, middle, moved, reach } from "/display.js";
 
 const MODES = [ // key, name, group, hint
   ["wiggle", "Wiggle", "Eyes", "Alternates between the two eyes' pictures. The nearest parts jump the most."],
@@ -52,7 +52,6 @@ export class Look {
     this.flatness = 0;
     this.used = null; // eyes that the panels are aligned to; null: the true eyes
     this.state = ""; // why the picture differs from what the two eyes should see
-    this.live = false; // true if the daemon measures the light, and calls `tell`
     this.onhead = () => {}; // called after the head has moved
     this.onframe = () => {}; // called after a picture has been drawn
     this.onmode = () => {}; // called when a mode is chosen, with true if it needs target pictures
@@ -66,6 +65,10 @@ export class Look {
 
   get eyes() {
     return this.eyesAt(this.onTheWay(this.head));
+  }
+
+  #draws(aligned) {
+    return panelDraws(this.stack, aligned, this.display.solved_px, this.flatness);
   }
 
   get alignment() {
@@ -96,7 +99,7 @@ export class Look {
   draw() {
     this.moving = performance.now();
     this.fresh = true;
-    if (this.isMeasured && !this.live) this.$(".light").textContent = this.display.targets[0] ? "…" : "";
+    if (this.isMeasured) this.$(".light").textContent = this.display.targets[0] ? "…" : "";
     this.isMeasured = false;
     this.next ??= requestAnimationFrame((now) => this.#frame(now));
   }
@@ -116,9 +119,9 @@ export class Look {
     this.frames += 1;
     const resting = !this.fresh && performance.now() - this.moving > REST_MS, { width, height, resized } = this.#fitted(resting);
     this.fresh = false;
-    const aligned = this.mode === "difference" ? unaligned(this.stack) : this.alignment;
-    this.quick = !resting && this.rays === 1 && this.flatness === 0 && !this.pupil && !["panels", "apart", "target", "difference"].includes(this.mode) ? aligned : null;
-    if (!this.quick) this.display.show(aligned, this.flatness);
+    const draws = this.#draws(this.mode === "difference" ? unaligned(this.stack) : this.alignment);
+    this.quick = !resting && this.rays === 1 && this.flatness === 0 && !this.pupil && !["panels", "apart", "target", "difference"].includes(this.mode) ? draws : null;
+    if (!this.quick) this.display.show(draws);
     const turning = this.mode === "wiggle";
     if (!resting || turning || ["panels", "apart", "target"].includes(this.mode)) {
       this.strip = undefined;
@@ -301,10 +304,10 @@ export class Look {
   #measure() {
     const { display, scene } = this;
     this.isMeasured = true;
-    if (this.live || !display.targets[0] || this.flatness > 0) return;
+    if (!display.targets[0] || this.flatness > 0) return;
     const { width, height } = scene.picture, picture = { width, height, fov_deg: scene.fov_deg };
     const columns = Math.floor(width / SAMPLED), rows = Math.floor(height / SAMPLED);
-    display.show(this.alignment, 0);
+    display.show(panelDraws(this.stack, this.alignment, display.solved_px));
     let error = 0, counted = 0;
     for (const side of [0, 1]) {
       const how = { nominal: scene.eyes_m[side], picture, columns, rows, stride: [width / columns, height / rows].map(Math.floor), side };
@@ -317,15 +320,10 @@ export class Look {
     }
     if (!counted) return void (this.$(".light").textContent = "No ray from here crosses all panels.");
     // Subtract the error due to compressing the target pictures.
-    this.tell(-10 * Math.log10(Math.max(error / counted - (scene.target_error ?? 0), 1e-9)));
-  }
-
-  // Show the PSNR of the light at both eyes, followed by `note`.
-  tell(light_db, note = "") {
-    this.light_db = light_db;
+    this.light_db = -10 * Math.log10(Math.max(error / counted - (scene.target_error ?? 0), 1e-9));
     const words = this.light_db > 33 ? "hard to distinguish from the target" : this.light_db > 27 ? "a good picture with faint traces of the other layers" :
       this.light_db > 21 ? "obvious ghosts and coloured edges" : "the layers fall apart";
-    this.$(".light").textContent = `Light at both eyes: ${this.light_db.toFixed(1)} dB against the target (${words})${note}.`;
+    this.$(".light").textContent = `Light at both eyes: ${this.light_db.toFixed(1)} dB against the target (${words}).`;
   }
 
   #modes() {
@@ -419,7 +417,7 @@ export class Look {
         this.draw();
       },
       picture: (eye, width, height, pupil_mm = 0) => {
-        this.display.show(this.alignment, this.flatness);
+        this.display.show(this.#draws(this.alignment));
         return this.display.picture({ eye: this.eyes[eye], fov_deg: this.scene.fov_deg, pupil_mm }, width, height);
       },
     };

@@ -1,0 +1,65 @@
+"""Tests the golden table: every implementation shows each frame as the reference does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import moderngl
+import numpy as np
+import pytest
+
+from runtime.clock import SimulatedClock
+from runtime.optics.presentation import Sampling, panel_draws, shown_layers
+from runtime.panels import processor
+from runtime.records import U8
+from tests.panels import presentation_table as table
+from tests.panels.drawn import DrawnPanels, ProcessorDrawnPanels
+
+NAMES = pytest.mark.parametrize("name", table.ROWS)
+
+
+def drawn(name: str, context: moderngl.Context | None) -> U8:
+    """(N, h, w, 3) what the shader shows, or without a context the processor."""
+    row = table.ROWS[name]
+    size_px, panels = (row.stack.width_px, row.stack.height_px), (row.settings,) * row.stack.count
+    sink: DrawnPanels | ProcessorDrawnPanels
+    if context is None:
+        sink = ProcessorDrawnPanels(clock=SimulatedClock(), size_px=size_px, panels=panels)
+    else:
+        sink = DrawnPanels(context, clock=SimulatedClock(), size_px=size_px, panels=panels)
+    sink.present(row.frame())
+    found = np.stack(sink.read_back())[..., :3]
+    sink.close()
+    return found
+
+
+@NAMES
+def test_the_shader_shows_what_the_reference_shows(gl: moderngl.Context, name: str) -> None:
+    assert table.agrees(drawn(name, gl), table.ROWS[name].reference(Sampling.CUBIC))
+
+
+@NAMES
+def test_the_processor_shows_what_the_reference_shows(name: str) -> None:
+    shown, expected = drawn(name, None), table.ROWS[name].reference(processor.BETWEEN)
+    if table.ROWS[name].coarser >= processor.COARSE and table.ROWS[name].move_m != table.STILL and "mixed" not in name:
+        shown, expected = shown[:, ::2, ::2], expected[:, ::2, ::2]  # the pixels between are averages
+    assert table.agrees(shown, expected)
+
+
+@NAMES
+def test_rows_differ_from_the_solution_as_it_is(name: str) -> None:
+    """Guards the table: each row but the first needs the law."""
+    row = table.ROWS[name]
+    frame = row.frame()
+    assert frame.solved is not None
+    changes = panel_draws(frame, row.mounts())[0].sampling is not Sampling.COPY or frame.flatness > 0
+    assert changes == (name != "still")
+    if changes and row.coarser == 1 and row.screen_px == (row.stack.width_px, row.stack.height_px):
+        assert np.abs(row.reference(Sampling.CUBIC)[0].astype(int) - frame.solved[0, ..., :3]).mean() > 3
+
+
+@pytest.mark.parametrize("flatness", [-0.5, 1.5])
+def test_a_weight_outside_its_range_is_limited(flatness: float) -> None:
+    frame = table.ROWS["aligned"].frame()
+    limited = replace(frame, flatness=min(max(flatness, 0.0), 1.0))
+    assert np.array_equal(shown_layers(replace(frame, flatness=flatness)), shown_layers(limited))
