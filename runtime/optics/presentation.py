@@ -64,7 +64,7 @@ def scale_and_shift(matrix: F64) -> PixelMap:
 UNMOVED = PixelMap(1.0, 1.0, 0.0, 0.0)
 
 
-class Sampling(StrEnum):
+class Interpolation(StrEnum):
     """How the solution is read between its pixels' centres."""
 
     COPY = "copy"  # every position is a pixel's centre
@@ -91,7 +91,7 @@ class PanelDraw:
     rest: int  # code outside the solution
     extended_px: int  # pixels by which the solution's edge is repeated, 0 or 1
     flatness: float  # weight of the flat picture; 1: the solution is not read, 0: the flat picture is not
-    sampling: Sampling
+    interpolation: Interpolation
     solved_from_shown: PixelMap  # from the panel's pixels to the solution's, as are all maps here
     relief: F32 | None = None  # (h, w); None: the content does not move
     relief_from_shown: PixelMap = UNMOVED
@@ -115,7 +115,7 @@ class PanelDraw:
     @property
     def copies_solved(self) -> bool:
         """True if the panel shows the solution's pixels as they are."""
-        return self.sampling is Sampling.COPY and not self.shows_flat and self.mount is None
+        return self.interpolation is Interpolation.COPY and not self.shows_flat and self.mount is None
 
     def solved_at(self, u: Pixels, v: Pixels) -> tuple[Pixels, Pixels]:
         """Return the solution's pixel positions (P1) for panel pixels. u and v are broadcast."""
@@ -132,7 +132,7 @@ def flatness_of(frame: PanelFrame) -> float:
 
 
 def panel_draws(
-    frame: PanelFrame, mounts: Sequence[Mount] = (), *, between: Sampling = Sampling.CUBIC
+    frame: PanelFrame, mounts: Sequence[Mount] = (), *, between: Interpolation = Interpolation.CUBIC
 ) -> tuple[PanelDraw, ...]:
     """Return what each panel shows for a frame.
 
@@ -159,9 +159,9 @@ def panel_draws(
         is_exact, to_solved = mount is None or mount.is_exact, aligned.then(by)
         extended_px = int(coarse or not is_exact)
         still = aligned == UNMOVED and relief is None and not extended_px
-        sampling = Sampling.COPY if still else Sampling.LINEAR if is_exact else between
+        interpolation = Interpolation.COPY if still else Interpolation.LINEAR if is_exact else between
         draws.append(
-            PanelDraw(size_px, solved_px, rest, extended_px, flatness, sampling, to_solved, relief, *moves, mount)
+            PanelDraw(size_px, solved_px, rest, extended_px, flatness, interpolation, to_solved, relief, *moves, mount)
         )
     return tuple(draws)
 
@@ -263,14 +263,14 @@ def _surrounded(solved: U8, draw: PanelDraw) -> F32:
 
 def _read(texels: F32, u: Pixels, v: Pixels, draw: PanelDraw) -> F32:
     """Return (h, w, 4) codes at positions in the solution, given its `_surrounded` pixels."""
-    reach = draw.extended_px + (1, 2)[draw.sampling is Sampling.CUBIC]  # farther out, everything is at rest
+    reach = draw.extended_px + (1, 2)[draw.interpolation is Interpolation.CUBIC]  # farther out, everything is at rest
     x = np.clip(u - 0.5, -float(reach), draw.solved_px[0] + reach - 1.0)
     y = np.clip(v - 0.5, -float(reach), draw.solved_px[1] + reach - 1.0)
-    if draw.sampling is Sampling.COPY:
+    if draw.interpolation is Interpolation.COPY:
         return _taken(texels, np.rint(x), np.rint(y), draw)
     low_x, low_y = np.floor(x), np.floor(y)
     right, down = (x - low_x).astype(np.float32)[..., None], (y - low_y).astype(np.float32)[..., None]
-    if draw.sampling is Sampling.LINEAR:
+    if draw.interpolation is Interpolation.LINEAR:
         above, below = (
             _between(_taken(texels, low_x, low_y + k, draw), _taken(texels, low_x + 1, low_y + k, draw), right)
             for k in (0, 1)

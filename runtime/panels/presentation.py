@@ -118,7 +118,7 @@ Case = tuple[str, ...]  # macros to define in the fragment shader
 
 def case_of(draw: PanelDraw) -> Case:
     """Return the macros for a record."""
-    solved = (draw.sampling.name, *["DISPLACED"] * (draw.relief is not None), *["MIXED"] * draw.shows_flat)
+    solved = (draw.interpolation.name, *["DISPLACED"] * (draw.relief is not None), *["MIXED"] * draw.shows_flat)
     return ("SOLVED", *solved) if draw.shows_solved else ()
 
 

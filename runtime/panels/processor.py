@@ -1,8 +1,8 @@
 """Draw the panels' pictures on the processor, for display PCs without a GPU.
 
 A software rasteriser runs the shader of `presentation` for one pixel after another and takes seven to twenty times as
-long. Both follow the records of `runtime.optics.presentation`. Here, registered panels have the sampling `linear`, and
-most coarse solutions are sampled at every other pixel (`COARSE`).
+long. Both follow the records of `runtime.optics.presentation`. Here, solutions are interpolated linearly on registered
+panels, and most coarse solutions are sampled at every other pixel (`COARSE`).
 
 This runs on the presenter's thread. At a refresh, it leaves no work to OpenCV's threads, which have a lower priority,
 and takes Python's global lock as rarely as possible.
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from runtime.config import PanelSettings
 from runtime.kernels import CURVE_ENTRIES, CURVE_STEPS, ScaleShift, ShownPanel, library
 from runtime.optics.malus import rest_code
-from runtime.optics.presentation import Mount, PanelDraw, PixelMap, Sampling, on_layer, panel_draws
+from runtime.optics.presentation import Interpolation, Mount, PanelDraw, PixelMap, on_layer, panel_draws
 from runtime.optics.rect import PixelRect, union
 from runtime.optics.stack import between_pixel_centres
 from runtime.panels.geometry import layer_from_screen, panel_from_screen
@@ -38,7 +38,7 @@ Array = TypeVar("Array", U8, F32)
 
 
 Line = tuple[float, float]  # scale, and shift in pixels, of a map along one axis
-BETWEEN = Sampling.LINEAR  # how to read solutions on registered panels
+BETWEEN = Interpolation.LINEAR  # how to read solutions on registered panels
 
 
 class Axis(NamedTuple):

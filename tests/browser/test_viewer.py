@@ -23,7 +23,7 @@ from runtime.browser.still import asset, half_floats, stack_table, viewer_html
 from runtime.config import StackGeometry
 from runtime.optics.alignment import align
 from runtime.optics.light import panels_from_centre
-from runtime.optics.presentation import PixelMap, Sampling, panel_draws, scale_and_shift, shown_layers
+from runtime.optics.presentation import Interpolation, PixelMap, panel_draws, scale_and_shift, shown_layers
 from runtime.optics.rpu import panel_from_image
 from runtime.optics.stack import PanelStack, Tilt
 from runtime.optics.views import image_from_stack
@@ -180,7 +180,7 @@ def page_pictures(folder: Path) -> dict[str, np.ndarray]:
 @pytest.mark.slow
 def test_panels_in_the_page_show_what_the_reference_shows(tmp_path: Path) -> None:
     for name, shown in page_pictures(tmp_path).items():
-        assert agrees(shown, ROWS[name].reference(Sampling.CUBIC)), name
+        assert agrees(shown, ROWS[name].reference(Interpolation.CUBIC)), name
 
 
 @pytest.mark.parametrize("stack", STACKS, ids=lambda stack: f"{stack.count} panels")

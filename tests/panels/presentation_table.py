@@ -9,7 +9,7 @@ import numpy as np
 
 from runtime.config import PanelSettings
 from runtime.optics.alignment import align
-from runtime.optics.presentation import Mount, Sampling, panel_draws, shown_picture
+from runtime.optics.presentation import Interpolation, Mount, panel_draws, shown_picture
 from runtime.optics.stack import PanelStack, Tilt
 from runtime.panels.presentation import mount_of
 from runtime.records import U8, PanelFrame
@@ -49,7 +49,7 @@ class Row:
         layer_px = self.stack.width_px, self.stack.height_px
         return (mount_of(self.settings, screen_px=self.screen_px, layer_px=layer_px),) * self.stack.count
 
-    def reference(self, between: Sampling) -> U8:
+    def reference(self, between: Interpolation) -> U8:
         """(N, h, w, 3) what the monitors show."""
         frame = self.frame()
         assert frame.solved is not None and frame.flat is not None

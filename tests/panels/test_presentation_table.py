@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from runtime.clock import SimulatedClock
-from runtime.optics.presentation import Sampling, panel_draws, shown_layers
+from runtime.optics.presentation import Interpolation, panel_draws, shown_layers
 from runtime.panels import processor
 from runtime.records import U8
 from tests.panels import presentation_table as table
@@ -35,7 +35,7 @@ def drawn(name: str, context: moderngl.Context | None) -> U8:
 
 @NAMES
 def test_the_shader_shows_what_the_reference_shows(gl: moderngl.Context, name: str) -> None:
-    assert table.agrees(drawn(name, gl), table.ROWS[name].reference(Sampling.CUBIC))
+    assert table.agrees(drawn(name, gl), table.ROWS[name].reference(Interpolation.CUBIC))
 
 
 @NAMES
@@ -52,10 +52,10 @@ def test_rows_differ_from_the_solution_as_it_is(name: str) -> None:
     row = table.ROWS[name]
     frame = row.frame()
     assert frame.solved is not None
-    changes = panel_draws(frame, row.mounts())[0].sampling is not Sampling.COPY or frame.flatness > 0
+    changes = panel_draws(frame, row.mounts())[0].interpolation is not Interpolation.COPY or frame.flatness > 0
     assert changes == (name != "still")
     if changes and row.coarser == 1 and row.screen_px == (row.stack.width_px, row.stack.height_px):
-        assert np.abs(row.reference(Sampling.CUBIC)[0].astype(int) - frame.solved[0, ..., :3]).mean() > 3
+        assert np.abs(row.reference(Interpolation.CUBIC)[0].astype(int) - frame.solved[0, ..., :3]).mean() > 3
 
 
 @pytest.mark.parametrize("flatness", [-0.5, 1.5])
