@@ -65,7 +65,7 @@ UNMOVED = PixelMap(1.0, 1.0, 0.0, 0.0)
 
 
 class Interpolation(StrEnum):
-    """How the solution is read between its pixels' centres."""
+    """Method of reading the solution between its pixels' centres."""
 
     COPY = "copy"  # every position is a pixel's centre
     LINEAR = "linear"  # bilinear, with weights of full precision
@@ -74,7 +74,7 @@ class Interpolation(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mount:
-    """How a monitor shows its layer: its position (registration, rotation, mirroring) and its grey curve."""
+    """Position of a layer on its monitor (registration, rotation, mirroring), and the monitor's grey curve."""
 
     screen_px: tuple[int, int]  # width and height
     layer_from_screen: F64  # 3x3 homography of pixels; the third coordinate is positive at the monitor's centre
@@ -84,7 +84,7 @@ class Mount:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PanelDraw:
-    """What one panel shows for a frame. Pixels of layers count from their corners."""
+    """Record of what one panel shows for a frame. Pixels of layers count from their corners."""
 
     size_px: tuple[int, int]  # the panel's columns and rows
     solved_px: tuple[int, int]  # the solution's; the panel's if there is no solution
