@@ -225,13 +225,13 @@ def shown_picture(draw: PanelDraw, solved: U8 | None, flat: U8 | None) -> U8:
         inside: NDArray[np.bool_] | None = None
         if draw.mount is not None:
             u, v, inside = on_layer(draw.mount, u, v, draw.size_px)
-        codes = np.zeros(())
+        codes: F32 = np.zeros((1, 1, 4), np.float32)
         if texels is not None:
             codes = _read(texels, *draw.solved_at(u, v), draw)
         if draw.shows_flat:
             assert flat is not None
             mixed = _bilinear(flat, u, v)
-            codes = codes + (mixed - codes) * np.float32(draw.flatness)
+            codes = np.asarray(codes + (mixed - codes) * np.float32(draw.flatness), np.float32)
         if inside is not None:
             codes = np.where(inside[..., None], codes, np.float32(0))
         if draw.mount is not None and draw.mount.curve is not None:
@@ -255,8 +255,8 @@ def on_layer(mount: Mount, u: Pixels, v: Pixels, size_px: tuple[int, int]) -> tu
 def _surrounded(solved: U8, draw: PanelDraw) -> F32:
     """Return a layer's codes as float32, extended by `extended_px` and then by one pixel of the rest code."""
     by = draw.extended_px
-    padded = np.pad(solved, ((by, by), (by, by), (0, 0)), mode="edge") if by else solved
-    padded = np.pad(padded, ((1, 1), (1, 1), (0, 0)), constant_values=draw.rest).astype(np.float32)
+    extended = np.pad(solved, ((by, by), (by, by), (0, 0)), mode="edge") if by else solved
+    padded = np.asarray(np.pad(extended, ((1, 1), (1, 1), (0, 0)), constant_values=draw.rest), np.float32)
     padded[..., 3] = 255.0
     return padded
 
@@ -291,8 +291,8 @@ def _taken(texels: F32, x: Pixels, y: Pixels, draw: PanelDraw) -> F32:
     columns = np.clip(x.astype(np.intp) + by, 0, width - 1)
     rows = np.clip(y.astype(np.intp) + by, 0, height - 1)
     # A pixel's four floats are gathered as a single number, which is faster.
-    found = texels.view(np.complex128).ravel().take(rows * width + columns)
-    return found.view(np.float32).reshape(*found.shape, 4)
+    found: Any = texels.view(np.complex128).ravel().take(rows * width + columns)
+    return np.asarray(found.view(np.float32).reshape(*found.shape, 4), np.float32)
 
 
 def _cubic(t: F32) -> tuple[F32, F32, F32, F32]:
@@ -320,7 +320,8 @@ def _bilinear(grid: U8 | F32, u: Pixels, v: Pixels) -> F32:
         return np.asarray(grid[rows, columns], np.float32)
     next_columns, next_rows = np.minimum(columns + 1, width - 1), np.minimum(rows + 1, height - 1)
     above, below = (
-        _between(np.float32(grid[at, columns]), np.float32(grid[at, next_columns]), right) for at in (rows, next_rows)
+        _between(np.array(grid[at, columns], np.float32), np.array(grid[at, next_columns], np.float32), right)
+        for at in (rows, next_rows)
     )
     return _between(above, below, down)
 

@@ -15,7 +15,7 @@ from runtime.content.registry import open_content
 from runtime.evaluation.refresh_quality import live_error
 from runtime.model.predictor import load_predictor
 from runtime.optics.alignment import align
-from runtime.optics.presentation import displacement, shown_layers
+from runtime.optics.presentation import displacement, panel_draws, shown_layers
 from runtime.optics.relief import RIM_PX, parallax, relief_of
 from runtime.optics.stack import PanelStack
 from runtime.plan.drawing import drawn_job, retina_pictures
@@ -91,7 +91,9 @@ def test_without_a_movement_or_a_middle_panel_nothing_is_displaced() -> None:
     assert parallax(STACK, old_m=middle, new_m=middle) is None
     even = PanelStack(0.5184, 0.2916, (-0.03, 0.03), 480, 270)
     assert parallax(even, old_m=middle, new_m=middle + 0.01) is None
-    assert displacement(None, parallax(STACK, old_m=middle, new_m=middle + 0.01), 0) is None
+    moved = align(STACK, solved_for_m=EYES_M, eyes_m=EYES_M + 0.01)
+    frame = PanelFrame(1, np.zeros((3, 9, 16, 4), np.uint8), 1, moved.solved_from_shown, parallax=moved.parallax)
+    assert all(draw.relief is None for draw in panel_draws(frame))
 
 
 def sheets(folder: Path) -> Path:
