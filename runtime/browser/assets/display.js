@@ -144,13 +144,13 @@ export const unaligned = (stack) => ({ maps: stack.x_m.map(() => [1, 1, 0, 0]), 
 // fractions of its size.
 export function panelDraws(stack, { maps, parallax }, solved_px, flatness = 0) {
   const size_px = [stack.width_px, stack.height_px], coarser = solved_px.map((px, k) => px / size_px[k]);
-  const still = { drift: [0, 0, 0], middles: maps, weights: maps.map(() => 0) }, { drift: [right, down, growth], middles, weights } = parallax ?? still;
+  const { drift: [right, down, growth], middles, weights } = parallax ?? { drift: [0, 0, 0], middles: maps, weights: maps };
   const by = ([su, sv, tu, tv], [u, v]) => [su * u, sv * v, tu * u, tv * v];
   return {
     size_px, solved_px, flatness, rest: stack.rest_code, extended_px: +coarser.some((by) => by !== 1),
     solved_from_shown: maps.map((map) => by(map, coarser)),
     relief_from_shown: middles.map((map) => by(map, size_px.map((px) => 1 / px))),
-    push: middles.map(([su, sv, tu, tv], n) => by([growth * su, growth * sv, right + growth * tu, down + growth * tv], coarser.map((by) => weights[n] * by))),
+    push: middles.map(([su, sv, tu, tv], n) => by([growth * su, growth * sv, right + growth * tu, down + growth * tv], coarser.map((by) => by * (parallax ? weights[n] : 0)))),
   };
 }
 
@@ -171,12 +171,13 @@ vec2 solved_at(int n, vec2 px) {
 // A layer as shown by its panel: aligned, mixed with the flat picture, and rounded to 8 bits by the framebuffer.
 const SHOW = `#version 300 es
 ${SOLVED_AT}
-uniform sampler2DArray layers, flat_picture; uniform int panel, extended_px; uniform float flatness;
+uniform sampler2DArray layers, flat_picture; uniform int panel; uniform float extended_px, flatness;
 out vec4 colour;
 vec3 texel(ivec2 at) { // a coarse solution is extended by a pixel, so that its edge does not fade
   ivec2 end = ivec2(solved_px);
-  bool inside = all(greaterThanEqual(at, ivec2(-extended_px))) && all(lessThan(at, end + extended_px));
-  return inside ? texelFetch(layers, ivec3(clamp(at, ivec2(0), end - 1), panel), 0).rgb : vec3(rest);
+  int by = int(extended_px);
+  bool inside = all(greaterThanEqual(at, ivec2(-by))) && all(lessThan(at, end + by));
+  return inside ? texelFetch(layers, ivec3(clamp(at, ivec2(0), end - 1), panel), 0).rgb : vec3(rest / 255.0);
 }
 void main() {
   vec2 place = clamp(solved_at(panel, gl_FragCoord.xy) - 0.5, vec2(-3.0), solved_px + 2.0), low = floor(place), w = place - low;
@@ -199,7 +200,7 @@ void main() {
   bool seen = true;
 #define THROUGH(n) h = into[n] * p; px = h.xy / h.z; at = solved_at(n, px) / solved_px; \\
   seen = seen && h.z > 0.0 && all(greaterThanEqual(px, vec2(0.0))) && all(lessThan(px, size_px)); \\
-  sum += clamp(at, 0.0, 1.0) == at ? texture(layers, vec3(at, n)).rgb : vec3(rest);
+  sum += clamp(at, 0.0, 1.0) == at ? texture(layers, vec3(at, n)).rgb : vec3(rest / 255.0);
   @EACH@
   vec3 s = sin(sum * 1.5707963267948966);
   colour = vec4(seen ? s * s : room, 1.0);
@@ -403,12 +404,10 @@ export class Display {
   // Set a program's uniforms from the result of `panelDraws`.
   #set(places, draws) {
     const g = this.g;
-    for (const name of ["solved_from_shown", "relief_from_shown", "push"]) g.uniform4fv(places[name], draws[name].flat());
-    g.uniform1f(places.rest, draws.rest / 255);
-    g.uniform2f(places.size_px, ...draws.size_px);
-    g.uniform2f(places.solved_px, ...draws.solved_px);
-    g.uniform1i(places.extended_px ?? null, draws.extended_px);
-    g.uniform1f(places.flatness ?? null, draws.flatness);
+    for (const [name, value] of Object.entries(draws)) {
+      const flat = [value].flat(2);
+      g[`uniform${Math.min(flat.length, 4)}fv`](places[name] ?? null, flat);
+    }
     g.activeTexture(g.TEXTURE2);
     g.bindTexture(g.TEXTURE_2D, this.relief);
     g.uniform1i(places.relief, 2);

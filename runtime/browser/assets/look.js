@@ -67,7 +67,7 @@ export class Look {
     return this.eyesAt(this.onTheWay(this.head));
   }
 
-  #draws(aligned) {
+  #draws(aligned = this.alignment) {
     return panelDraws(this.stack, aligned, this.display.solved_px, this.flatness);
   }
 
@@ -119,7 +119,7 @@ export class Look {
     this.frames += 1;
     const resting = !this.fresh && performance.now() - this.moving > REST_MS, { width, height, resized } = this.#fitted(resting);
     this.fresh = false;
-    const draws = this.#draws(this.mode === "difference" ? unaligned(this.stack) : this.alignment);
+    const draws = this.#draws(this.mode === "difference" ? unaligned(this.stack) : undefined);
     this.quick = !resting && this.rays === 1 && this.flatness === 0 && !this.pupil && !["panels", "apart", "target", "difference"].includes(this.mode) ? draws : null;
     if (!this.quick) this.display.show(draws);
     const turning = this.mode === "wiggle";
@@ -307,7 +307,7 @@ export class Look {
     if (!display.targets[0] || this.flatness > 0) return;
     const { width, height } = scene.picture, picture = { width, height, fov_deg: scene.fov_deg };
     const columns = Math.floor(width / SAMPLED), rows = Math.floor(height / SAMPLED);
-    display.show(panelDraws(this.stack, this.alignment, display.solved_px));
+    display.show(this.#draws());
     let error = 0, counted = 0;
     for (const side of [0, 1]) {
       const how = { nominal: scene.eyes_m[side], picture, columns, rows, stride: [width / columns, height / rows].map(Math.floor), side };
@@ -417,7 +417,7 @@ export class Look {
         this.draw();
       },
       picture: (eye, width, height, pupil_mm = 0) => {
-        this.display.show(this.#draws(this.alignment));
+        this.display.show(this.#draws());
         return this.display.picture({ eye: this.eyes[eye], fov_deg: this.scene.fov_deg, pupil_mm }, width, height);
       },
     };
