@@ -152,7 +152,8 @@ INLINE void locate(const Shown &shown, int r, int begin, int count, const float 
 // Return the relief at a position in its pixels.
 INLINE float relief_at(const Shown &shown, float x, float y) {
   x = std::min(std::max(x, 0.0f), float(shown.relief_columns - 1)), y = std::min(std::max(y, 0.0f), float(shown.relief_rows - 1));
-  const int column = int(x), row = int(y);
+  // Clamped again as integers, because a position is not a number at the homography's horizon.
+  const int column = std::clamp(int(x), 0, shown.relief_columns - 1), row = std::clamp(int(y), 0, shown.relief_rows - 1);
   const float *line = shown.relief + int64_t(row) * shown.relief_columns + column;
   const int next = column + 1 < shown.relief_columns, below = row + 1 < shown.relief_rows ? shown.relief_columns : 0;
   const float right = x - float(column), top = line[0] + (line[next] - line[0]) * right;

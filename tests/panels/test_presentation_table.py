@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from runtime.clock import SimulatedClock
+from runtime.config import PanelSettings
 from runtime.optics.presentation import Interpolation, panel_draws, shown_layers
 from runtime.panels import processor
 from runtime.records import U8
@@ -63,3 +64,18 @@ def test_a_weight_outside_its_range_is_limited(flatness: float) -> None:
     frame = table.ROWS["aligned"].frame()
     limited = replace(frame, flatness=min(max(flatness, 0.0), 1.0))
     assert np.array_equal(shown_layers(replace(frame, flatness=flatness)), shown_layers(limited))
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_horizon_across_a_panel_reads_nothing_outside_the_relief(sign: float) -> None:
+    """Halfway down, the homography's third coordinate is zero."""
+    height = table.STACK.height_px
+    bent = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, sign / (height / 2 + 0.5), -sign))
+    row = replace(table.ROWS["homography"], settings=PanelSettings(homography=bent))
+    panels = (row.settings,) * row.stack.count
+    sink = ProcessorDrawnPanels(
+        clock=SimulatedClock(), size_px=(row.stack.width_px, row.stack.height_px), panels=panels
+    )
+    sink.present(row.frame())
+    assert np.stack(sink.read_back()).shape == (3, height, row.stack.width_px, 4)
+    sink.close()
