@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from base64 import b64encode
 from dataclasses import replace
 from pathlib import Path
@@ -147,13 +148,18 @@ def library_scenes(settings: ContentSettings) -> tuple[str, ...]:
 
 
 def pictures(run: Run) -> dict[str, Any]:
-    """Return thumbnails of the latest refresh for the page, as base64-encoded JPEG files."""
-    refresh = run.presenter.last
+    """Return thumbnails of the latest refresh for the page, as base64-encoded JPEG files, with its time and state."""
+    refresh, state = run.presenter.last, run.presenter.machine.name
     if refresh is None:
         return {"frame": None, "jpegs": {}}
     fov_deg = run.presenter.run_cell.state.settings.content.fov_deg
     jpegs = pictures_of(refresh, run.presenter.stack, fov_deg=fov_deg)
-    return {"frame": refresh.account.frame, "jpegs": {name: b64encode(jpeg).decode() for name, jpeg in jpegs.items()}}
+    return {
+        "frame": refresh.account.frame,
+        "time_s": time.time(),
+        "state": state,
+        "jpegs": {name: b64encode(jpeg).decode() for name, jpeg in jpegs.items()},
+    }
 
 
 WIDTH_PX = 256  # width of each thumbnail on the page

@@ -99,7 +99,7 @@ class Film:
 
     def _choose(self) -> None:
         """Choose the streams to show, and their decoders."""
-        videos = list(self._container.streams.video)
+        videos = [stream for stream in self._container.streams.video if stream.codec_context is not None]
         streams = [stream for stream in videos if not stream.disposition & COVER] or videos[:1]
         if not streams:
             self.close()

@@ -223,3 +223,12 @@ def test_a_scene_may_be_a_file_url(tmp_path: Path, context: Any, stack: PanelSta
     assert source.info.name == "a film é"
     with pytest.raises(InputError, match="is on another computer; mount the share"):
         open_content(ContentSettings(scene="smb://nas/films/a.mp4"), stack, context)
+
+
+def test_a_film_in_an_unknown_code_is_refused_in_one_line(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.mkv", [(0, grey(90)), (100, grey(90))])
+    data = path.read_bytes()
+    assert data.count(b"V_MPEG4/ISO/ASP") == 1
+    path.write_bytes(data.replace(b"V_MPEG4/ISO/ASP", b"V_NOBODY/KNOWS/"))
+    with pytest.raises(InputError, match="cannot be decoded as a film"):
+        Film(path)

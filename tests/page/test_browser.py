@@ -26,6 +26,7 @@ from tests.waiting import PATIENT, eventually
 pytestmark = pytest.mark.slow
 
 CONTROLS = (
+    "pictures follow the state", "plots have an axis", "stages have a line each", "unused modules are no savings",
     "state is shown", "pictures are shown", "pause", "resume", "flat", "resume by the keyboard", "reload", "scene",
     "and those that need data are named",
     "a scene that is not there", "scene back", "black box", "it says that the daemon is gone",

@@ -7,6 +7,8 @@ import { ask, keep, token } from "/session.js";
 const $ = (id) => document.getElementById(id);
 const SVG = "http://www.w3.org/2000/svg";
 const KEPT = 240; // number of points in a plot, which covers two minutes
+const LEAST_PLOTTED = 20; // a plot covers at least this many steps
+const OLD_S = 1; // pictures older than this are dimmed
 const STATUS_MS = 500, PICTURES_MS = 400, LOG_MS = 1000, ABOUT_MS = 5000, RETRY_MS = 1000;
 const ZOOMED_SIGMAS = 20; // radius of the drawn uncertainty: two standard deviations, enlarged ten times
 
@@ -61,9 +63,12 @@ const PLOTS = [
   const svg = element("svg", { viewBox: `0 0 ${KEPT} 56`, preserveAspectRatio: "none", "aria-hidden": "true" });
   const curve = element("path");
   svg.append(curve);
-  box.append(line, svg);
+  const axis = html("div"), [most, least] = ["most", "least"].map((name) => Object.assign(html("span"), { className: name }));
+  axis.className = "axis";
+  axis.append(svg, most, least);
+  box.append(line, axis);
   $("plots").append(box);
-  return { value, digits, shown, curve, values: [] };
+  return { value, digits, shown, curve, most, least, values: [] };
 });
 
 function plot(status) {
@@ -75,12 +80,16 @@ function plot(status) {
     const known = p.values.filter((v) => v !== null);
     const most = Math.max(1e-9, ...known) * 1.1;
     const least = Math.min(0, ...known);
-    const begin = KEPT - p.values.length;
+    const step = KEPT / Math.max(p.values.length - 1, LEAST_PLOTTED); // the curve fills the plot
+    setText(p.most, known.length ? number(most, p.digits) : "");
+    setText(p.least, known.length ? number(least, p.digits) : "");
     const height = (v) => (54 - (52 * (v - least)) / (most - least)).toFixed(1);
     // Leave a gap in the curve where a value is unknown.
-    const steps = p.values.map((v, i) => v === null ? "" : `${i && p.values[i - 1] !== null ? "L" : "M"}${begin + i},${height(v)}`);
+    const steps = p.values.map((v, i) => v === null ? "" : `${i && p.values[i - 1] !== null ? "L" : "M"}${(i * step).toFixed(1)},${height(v)}`);
     p.curve.setAttribute("d", steps.join(""));
   }
+  const span_s = (Math.max(PLOTS[0].values.length - 1, LEAST_PLOTTED) * STATUS_MS) / 1000;
+  setText($("plots-span"), `from left to right: the last ${number(span_s, 0)} seconds`);
 }
 
 // Plans of the eyes and panels, seen from above and from the side.
@@ -126,14 +135,15 @@ function figures(status) {
     "view error, estimated": status.view_error_estimated_mm ? `${number(status.view_error_estimated_mm.p50)} mm (p50), ${number(status.view_error_estimated_mm.p95)} (p95)` : "–",
     ...(status.view_error_mm ? { "view error": `${number(status.view_error_mm.p50)} mm (p50), ${number(status.view_error_mm.p95)} (p95)` } : {}),
     ...(typeof status.live_db === "number" ? { "live quality": `${number(status.live_db)} dB at the true eyes` } : {}),
-    stages: Object.entries(status.stage_ms ?? {}).filter(([, v]) => v).map(([k, v]) => `${k} ${number(v.p50, 2)}`).join(", ") + " ms (p50)",
+    "stages, median (and p99)": Object.entries(status.stage_ms ?? {}).filter(([, v]) => v)
+      .map(([k, v]) => `${k}: ${number(v.p50, 2)} ms (${number(v.p99, 2)} ms)`).join("\n") || "–",
     "black box": status.blackbox ? `${number(status.blackbox.kept_s, 0)} s kept, ${number(status.blackbox.kept_mib)} MiB; last file: ${status.blackbox.last_file ?? "none"}` : "–",
   };
   if (status.loading) rows.loading = status.loading;
   if (status.refused) rows.refused = status.refused;
   const list = $("numbers");
   if (list.children.length !== 2 * Object.keys(rows).length) {
-    list.replaceChildren(...Object.keys(rows).flatMap((name) => [html("dt", name), html("dd")]));
+    list.replaceChildren(...Object.keys(rows).flatMap((name) => [html("dt", name), Object.assign(html("dd"), { className: name.startsWith("stages") ? "stages" : "" })]));
   }
   Object.entries(rows).forEach(([name, text], i) => {
     setText(list.children[2 * i], name);
@@ -145,7 +155,8 @@ function leftOut(status) {
   const key = JSON.stringify(status.plan);
   if ($("plan").dataset.key !== key) {
     $("plan").dataset.key = key;
-    $("plan").replaceChildren(...(status.plan ?? []).map((item) => {
+    // Modules that were not imported save nothing while the display runs.
+    $("plan").replaceChildren(...(status.plan ?? []).filter((item) => item.what !== "optional parts").map((item) => {
       const row = html("tr");
       row.append(html("td", item.what), html("td", item.why),
         html("td", item.saves_ms === null ? "not measured" : `${number(item.saves_ms)} ms`),
@@ -197,6 +208,24 @@ function pictures(answer) {
     setText(caption, NAMED(name) + (data ? "" : ": no viewer"));
   }
   box.dataset.frame = answer.frame ?? "";
+  pictured = { time_s: answer.time_s, state: answer.state, arrived_ms: performance.now() };
+  pictureTime();
+}
+
+// The pictures' time and state. Pictures that are old or of another state than the one shown are dimmed.
+let pictured = null;
+
+function pictureTime() {
+  if (!pictured?.time_s) return;
+  const age_s = (performance.now() - pictured.arrived_ms) / 1000, old = age_s > OLD_S || !running;
+  $("pictures").parentElement.toggleAttribute("data-old", old);
+  setText($("pictures-when"), `${clock(pictured.time_s)}, ${pictured.state}${old ? `, ${number(age_s, 0)} s ago` : ""}`);
+}
+
+async function lookAtPictures() {
+  const answer = await lookUp("pictures");
+  if (answer.ok) pictures(answer);
+  pictureTime();
 }
 
 // Scenes.
@@ -309,6 +338,7 @@ function show(status) {
   const reason = status.reason ?? "", late = /solutions take|has not answered for/.test(reason);
   setText($("state"), hangs ? "not responding" : late ? "late" : status.state ?? "starting");
   $("state").dataset.state = hangs ? "gone" : late ? "holding" : (status.state ?? "starting").split(":")[0];
+  if (pictured && status.state !== pictured.state) lookAtPictures();
   setText($("reason"), late ? `${reason}; use the model fast or panels with fewer pixels (the panels still follow the eyes)` : reason);
   if (status.state === undefined) return; // no refresh yet
   document.querySelector('[data-command="pause"]').setAttribute("aria-pressed", String(status.paused));
@@ -345,9 +375,8 @@ every(STATUS_MS, async () => {
   else gone(status.error, status.hangs);
 });
 every(PICTURES_MS, async () => {
-  if (!running || document.hidden) return;
-  const answer = await lookUp("pictures");
-  if (answer.ok) pictures(answer);
+  pictureTime();
+  if (running && !document.hidden) await lookAtPictures();
 });
 every(LOG_MS, async () => {
   if (!running) return;
