@@ -29,6 +29,8 @@ Wheels of binary packages bundle further libraries, each under the licence in th
 OpenBLAS and the GCC runtime (numpy, scipy), FFmpeg under LGPL-2.1 (opencv), FFmpeg with x264 and x265
 under GPL-2.0 or later (av), GLFW under Zlib (glfw).
 
+The compiled loops include nanobind (BSD-3-Clause) and robin-map (MIT); their texts are in `runtime/kernels/LICENSE`.
+
 The networks that find eyes (`runtime/eyes/models`) are under Apache-2.0 (the text in LICENSE): `yunet.onnx` is YuNet as
 its authors publish it (ShiqiYu/libfacedetection.train); `face_mesh.onnx` and `iris.onnx` are MediaPipe's face landmark
 and iris models (Google LLC), converted by `docs/make_eye_models.sh`.

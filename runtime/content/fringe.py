@@ -8,13 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runtime.content.shapes import I32, Shape, welded
-from runtime.kernels import OutlinedPart, library
+from runtime.kernels import library
 from runtime.records import F32, F64
+
+if TYPE_CHECKING:
+    from runtime.kernels.compiled import OutlinedPart
 
 CORNER_FLOATS = 5 + 9  # clip coordinates and coverage (5), attributes (9)
 TRIANGLES = (0, 2, 1, 1, 2, 3)
@@ -80,9 +84,7 @@ class OutlineRamps:
             parts: For each part, by number, its edges and its vertices (v, 12). A vertex consists of its position in
                 the part's frame (3), and attributes that the ramps' corners take from it.
         """
-        self._held = parts
-        self._index = {number: n for n, number in enumerate(parts)}
-        self._parts = (OutlinedPart * len(parts))(*(_outlined(*part) for part in parts.values()))
+        self._parts = {number: _outlined(*part) for number, part in parts.items()}
         self._ramps = np.empty((sum(len(edges.faces) for edges, _ in parts.values()), 4, CORNER_FLOATS), np.float32)
 
     def along(
@@ -105,21 +107,16 @@ class OutlineRamps:
             coverage, and the attributes (9) of the edge's vertex nearest to it. `TRIANGLES` states which
             corners form a ramp's two triangles.
         """
-        order, counts = (
-            np.array([self._index[number] for number, _, _ in seen], np.int32),
-            np.zeros(len(seen), np.int32),
-        )
-        for n, (_, eye, clip_from_part) in zip(order.tolist(), seen, strict=True):
-            self._parts[n].eye[:] = eye.tolist()
-            self._parts[n].clip_from_part[:] = clip_from_part.ravel().tolist()
-        library().outline_ramps(
-            self._parts, order.ctypes.data, len(seen), width_px, height_px, ramp_px,
-            self._ramps.ctypes.data, counts.ctypes.data,
-        )  # fmt: skip
-        return self._ramps[: counts.sum()], counts.tolist()
+        counts: list[int] = []
+        for number, eye, clip_from_part in seen:
+            eye, clip_from_part = (np.ascontiguousarray(array, np.float64) for array in (eye, clip_from_part))
+            at = (width_px, height_px), ramp_px, self._ramps, sum(counts)
+            counts.append(self._parts[number].ramps(eye, clip_from_part, *at))
+        return self._ramps[: sum(counts)], counts
 
 
 def _outlined(edges: Edges, vertices: F32) -> OutlinedPart:
-    arrays = vertices, edges.faces, edges.ends, edges.apex, edges.normals, edges.heights
-    assert all(array.flags.c_contiguous for array in arrays)
-    return OutlinedPart(*(array.ctypes.data for array in arrays), len(edges.faces), len(edges.heights))
+    part: OutlinedPart = library().OutlinedPart(
+        vertices, edges.faces, edges.ends, edges.apex, edges.normals, edges.heights
+    )
+    return part

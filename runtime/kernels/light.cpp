@@ -1,32 +1,8 @@
 // Squared error of an eye's view of the displayed layers, computed ray by ray for a range of rows
 // (runtime/optics/light.py).
-#include <cstdint>
-
-#include "sampling.hpp"
+#include "loops.hpp"
 
 namespace {
-
-constexpr int TABLE_STEPS = 16;  // table entries per code value for bilinearly sampled rays
-
-struct View {
-  const uint8_t *layers;  // (panels, height, width, components)
-  int32_t panels, height, width, components;
-  const float *target;  // (rows, columns, 3) intensities
-  int32_t rows, columns;
-  const double *centre_from_image;   // (3, 3) homography from picture pixels to centre-panel pixels
-  const double *panels_from_centre;  // (points, panels, 3, 3) homographies from the centre panel to each panel
-  const double *toward;              // (3) vector whose product with (u, v, 1) is negative for rays towards the panels
-  const float *table;                // intensity for each sum of codes; sums are rounded to an index
-  int64_t first_ray;                 // number of the first ray
-  // points: number of points on the pupil. rays: rays along a pixel's side in each set, or 0 for a single ray, sampled
-  // bilinearly. step: only every step-th pixel in every step-th row is measured.
-  int32_t points, rays, step;
-};
-
-struct Result {
-  double total;
-  int64_t counted;
-};
 
 // Return the random bits for a ray's number (splitmix64). The lower 24 bits are used for the horizontal position within
 // the pixel, the next 24 for the vertical position, and the upper 16 for the pupil point.
@@ -68,12 +44,8 @@ INLINE bool see(const View &view, double u, double v, int point, float *seen) {
   return true;
 }
 
-}  // namespace
-
 // Sum the products of the two ray sets' errors over every step-th row from `first` to `end` - 1, and count the terms.
-FOR_EVERY_CPU int32_t squared_error(const View *given, int first, int end, Result *result) {
-  const View &view = *given;
-  if (view.step < 1 || view.rays < 0 || view.rays > 1024 || view.points < 1 || first < 0 || end > view.rows) return UNUSABLE;
+INLINE ErrorSum squared_error_any(const View &view, int first, int end) {
   const int in_set = std::max(view.rays * view.rays, 1), sets = view.rays ? 2 : 1, side = std::max(view.rays, 1);
   double total = 0;
   int64_t counted = 0;
@@ -100,8 +72,9 @@ FOR_EVERY_CPU int32_t squared_error(const View *given, int first, int end, Resul
         total += (seen[0][k] / float(in_set) - target[k]) * (seen[sets - 1][k] / float(in_set) - target[k]);
       counted += 3;
     }
-  *result = {total, counted};
-  return DONE;
+  return {total, counted};
 }
 
-extern "C" { extern const int32_t view_bytes = sizeof(View), reports_status = 1; }
+}  // namespace
+
+FOR_EVERY_LEVEL(squared_error, ErrorSum, (const View &view, int first, int end), (view, first, end))

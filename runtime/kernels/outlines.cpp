@@ -1,25 +1,10 @@
 // Find the edges that are on a part's outline, and build a ramp along each (runtime/content/fringe.py).
-#include <vector>
-
-#include "sampling.hpp"
+#include "loops.hpp"
 
 namespace {
 
-constexpr int VERTEX = 12;         // floats per vertex: position (3), attributes
-constexpr int CORNER = 5 + 9;      // floats per corner of a ramp: clip coordinates (4), coverage, attributes
 constexpr double NEAREST = 1e-6;   // smallest clip coordinate w of an edge that gets a ramp
 constexpr double SHORTEST = 1e-3;  // length in pixels of the shortest edge that has a direction
-
-struct OutlinedPart {
-  const float *vertices;   // (v, VERTEX)
-  const int32_t *faces;    // (edges, 2) the faces at each edge; the second is -1 at a border
-  const int32_t *ends;     // (edges, 2, 2) each face's vertices at the edge's ends
-  const int32_t *apex;     // (edges, 2) each face's third vertex
-  const double *normals;   // (triangles, 3)
-  const double *heights;   // (triangles); a face is visible from an eye if eye · normal > height
-  int32_t edges, triangles;
-  double eye[3], clip_from_part[16];
-};
 
 struct Clip {
   double x, y, z, w;
@@ -37,11 +22,11 @@ INLINE void write_corner(float *corner, Clip at, float coverage, const float *ve
 }
 
 // Write the ramp along an edge, given its ends and its visible face's third vertex. Return false if it gets none.
-INLINE bool write_ramp(const OutlinedPart &part, const float *const vertex[3], double half_width_px, double half_height_px, double ramp_px, float *ramp) {
+INLINE bool write_ramp(const double *clip_from_part, const float *const vertex[3], double half_width_px, double half_height_px, double ramp_px, float *ramp) {
   Clip clip[3];
   double u[3], v[3];
   for (int k = 0; k < 3; ++k) {
-    clip[k] = projected(part.clip_from_part, vertex[k]);
+    clip[k] = projected(clip_from_part, vertex[k]);
     if (!(clip[k].w > NEAREST)) return false;
     u[k] = clip[k].x / clip[k].w * half_width_px, v[k] = clip[k].y / clip[k].w * half_height_px;
   }
@@ -60,27 +45,22 @@ INLINE bool write_ramp(const OutlinedPart &part, const float *const vertex[3], d
 
 }  // namespace
 
-// Write the ramps (4 corners each) of parts in a given order, and how many each of them has.
-extern "C" void outline_ramps(const OutlinedPart *parts, const int32_t *order, int count, double width_px, double height_px, double ramp_px, float *ramps, int32_t *counts) {
-  std::vector<uint8_t> facing;
-  for (int k = 0; k < count; ++k) {
-    const OutlinedPart &part = parts[order[k]];
-    facing.resize(part.triangles);
-    for (int t = 0; t < part.triangles; ++t) {
-      const double *n = part.normals + 3 * t;
-      facing[t] = n[0] * part.eye[0] + n[1] * part.eye[1] + n[2] * part.eye[2] > part.heights[t];
-    }
-    counts[k] = 0;
-    for (int e = 0; e < part.edges; ++e) {
-      const int32_t one = part.faces[2 * e], two = part.faces[2 * e + 1];
-      if (two >= 0 && facing[one] == facing[two]) continue;
-      const int which = two < 0 || facing[one] ? 0 : 1;
-      const int32_t *ends = part.ends + 4 * e + 2 * which;
-      const float *const vertex[3] = {part.vertices + VERTEX * ends[0], part.vertices + VERTEX * ends[1],
-                                      part.vertices + VERTEX * part.apex[2 * e + which]};
-      if (write_ramp(part, vertex, width_px / 2, height_px / 2, ramp_px, ramps)) ramps += 4 * CORNER, ++counts[k];
-    }
+int outline_ramps(const OutlinedPart &part, const double *eye, const double *clip_from_part, double width_px, double height_px, double ramp_px, float *ramps) {
+  std::vector<uint8_t> facing(part.triangles);
+  for (int t = 0; t < part.triangles; ++t) {
+    const double *n = part.normals + 3 * t;
+    facing[t] = n[0] * eye[0] + n[1] * eye[1] + n[2] * eye[2] > part.heights[t];
   }
+  int count = 0;
+  for (int e = 0; e < part.edges; ++e) {
+    const int32_t one = part.faces[2 * e], two = part.faces[2 * e + 1];
+    if (two >= 0 && facing[one] == facing[two]) continue;
+    const int which = two < 0 || facing[one] ? 0 : 1;
+    const int32_t *ends = part.ends + 4 * e + 2 * which;
+    const float *const vertex[3] = {part.vertices + VERTEX * ends[0], part.vertices + VERTEX * ends[1],
+                                    part.vertices + VERTEX * part.apex[2 * e + which]};
+    float *ramp = ramps + int64_t(count) * 4 * CORNER;
+    if (write_ramp(clip_from_part, vertex, width_px / 2, height_px / 2, ramp_px, ramp)) ++count;
+  }
+  return count;
 }
-
-extern "C" { extern const int32_t outlined_part_bytes = sizeof(OutlinedPart); }

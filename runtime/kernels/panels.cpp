@@ -9,6 +9,8 @@
 
 #include "sampling.hpp"
 
+#define EXPORTED extern "C" __attribute__((visibility("default")))
+
 namespace {
 
 constexpr int CURVE = 1024;      // entries of a grey curve for each channel, indexed by quarters of a code
@@ -319,10 +321,7 @@ INLINE void widen(const Shown &shown, const uint32_t *line, uint8_t *screen) {
   if (shown.columns % 2) pixels[shown.columns - 1] = shown.curve ? curved(line[pairs]) : line[pairs];
 }
 
-}  // namespace
-
-FOR_EVERY_CPU void draw_rows(const Shown *given, int begin, int end) {
-  const Shown shown = *given;
+INLINE void draw_rows_any(const Shown &shown, int begin, int end) {
   Block block;
   Relief kept;
   if (shown.every == 1) {
@@ -347,7 +346,7 @@ FOR_EVERY_CPU void draw_rows(const Shown *given, int begin, int end) {
   }
 }
 
-namespace {
+FOR_EVERY_LEVEL(draw_rows, void, (const Shown &shown, int begin, int end), (shown, begin, end))
 
 struct Part {
   const Shown *shown;
@@ -357,7 +356,7 @@ struct Part {
 void *draw_part(void *given) {
   const Part &part = *static_cast<const Part *>(given);
   for (const Shown *shown = part.shown; shown < part.shown + part.count; ++shown)
-    draw_rows(shown, shown->rows * part.part / part.parts, shown->rows * (part.part + 1) / part.parts);
+    draw_rows(*shown, shown->rows * part.part / part.parts, shown->rows * (part.part + 1) / part.parts);
   return nullptr;
 }
 
@@ -388,7 +387,7 @@ bool start(pthread_t &thread, Part &part) {
 // Copy a turned picture into the middle of one that has a border. The turned picture's next row and next column are
 // `row_step` and `column_step` bytes away. Return the box of the pixels that differ from the border in colour: its left,
 // top, right and bottom edge in the framed picture. Without a border, the box is meaningless.
-extern "C" void frame_picture(const uint8_t *turned, int64_t row_step, int64_t column_step, int rows, int columns, uint8_t *framed, int border_px, int extended, int32_t *box) {
+EXPORTED void frame_picture(const uint8_t *turned, int64_t row_step, int64_t column_step, int rows, int columns, uint8_t *framed, int border_px, int extended, int32_t *box) {
   const int width = columns + 2 * border_px;
   auto *middle = reinterpret_cast<Word *>(framed) + border_px * (width + 1);
   const Word border = *reinterpret_cast<const Word *>(framed) << 8;  // without alpha
@@ -413,7 +412,7 @@ extern "C" void frame_picture(const uint8_t *turned, int64_t row_step, int64_t c
 }
 
 // Draw pictures on several threads with the caller's priority. Each thread draws the same share of every picture's rows.
-extern "C" void draw_panels(const Shown *shown, int count, int threads) {
+EXPORTED void draw_panels(const Shown *shown, int count, int threads) {
   const int parts = std::clamp(threads, 1, MAX_THREADS);
   Part part[MAX_THREADS];
   pthread_t thread[MAX_THREADS];
@@ -426,4 +425,4 @@ extern "C" void draw_panels(const Shown *shown, int count, int threads) {
     if (started[n]) pthread_join(thread[n], nullptr);
 }
 
-extern "C" { extern const int32_t shown_bytes = sizeof(Shown); }
+EXPORTED const int32_t shown_bytes = sizeof(Shown);

@@ -5,16 +5,28 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <stdexcept>
 
-// Exported functions, and the functions inlined into them, are compiled for three processor levels, or with ONE_LEVEL
-// only for that of the compiler's options.
+// Define a function that calls NAME_any, which must be INLINE. It is compiled for three levels of x86-64 processors, and
+// calls choose the one for `processor_level`. With ONE_LEVEL, it is only compiled for the compiler's options.
 #if !defined(ONE_LEVEL) && defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
-#define FOR_EVERY_CPU extern "C" __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
+#define EVERY_LEVEL 1
+#define FOR_EVERY_LEVEL(NAME, RESULT, PARAMETERS, ARGUMENTS) \
+  __attribute__((target("arch=x86-64-v4"))) static RESULT NAME##_v4 PARAMETERS { return NAME##_any ARGUMENTS; } \
+  __attribute__((target("arch=x86-64-v3"))) static RESULT NAME##_v3 PARAMETERS { return NAME##_any ARGUMENTS; } \
+  static RESULT NAME##_v1 PARAMETERS { return NAME##_any ARGUMENTS; } \
+  RESULT NAME PARAMETERS { \
+    return processor_level == 4 ? NAME##_v4 ARGUMENTS : processor_level == 3 ? NAME##_v3 ARGUMENTS : NAME##_v1 ARGUMENTS; \
+  }
 #else
-#define FOR_EVERY_CPU extern "C"
+#define EVERY_LEVEL 0
+#define FOR_EVERY_LEVEL(NAME, RESULT, PARAMETERS, ARGUMENTS) \
+  RESULT NAME PARAMETERS { return NAME##_any ARGUMENTS; }
 #endif
 #define INLINE static inline __attribute__((always_inline))
 #define VECTORISED _Pragma("GCC ivdep")
+
+extern int processor_level;  // 4 (AVX-512), 3 (AVX2) or 1
 
 constexpr int LANES = 32;     // elements per vector in the loops; the compiler splits vectors as the processor requires
 constexpr int TILE_PX = 256;  // pixels in a row that are sampled together; their data fits in the first-level cache
@@ -35,7 +47,10 @@ struct Image {
   const int16_t *row(int r) const { return data + int64_t(r % ring) * stride; }
 };
 
-constexpr int32_t DONE = 0, UNUSABLE = 1, NO_MEMORY = 2;  // what exported functions return
+// Throw std::invalid_argument, which is a ValueError in Python, unless a condition holds.
+inline void require(bool condition, const char *message) {
+  if (!condition) throw std::invalid_argument(message);
+}
 
 // Return true if homographies are finite, and small enough for products of a few entries and pixels to be finite.
 inline bool usable(const double *homographies, int64_t count) {

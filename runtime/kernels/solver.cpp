@@ -3,10 +3,7 @@
 // Rays are processed row by row, and their residuals are stored in a ring buffer of rows. A panel row is updated once
 // all the rays that cross it have been processed. Its phasors are kept in another ring buffer, from the first ray that
 // needs them to the last. Only the panels are read from and written to main memory.
-#include <stdexcept>
-#include <vector>
-
-#include "sampling.hpp"
+#include "solver.hpp"
 
 namespace {
 
@@ -15,54 +12,7 @@ constexpr float UNIT = 8100;     // 1 in fixed-point phasors; rounded products m
 constexpr float PI = 3.14159265f;
 constexpr double NEAR_PX = 0.5;  // rays count if they cross every panel at least this far inside its edges
 constexpr double EDGE_CLAMP_PX = 2;  // bundles of rays at the border extend this far beyond the picture (clamp to edge)
-constexpr int MAX_SETS = 16;     // ray sets
 static_assert(2 * FIELDS <= 2 * MAX_PANELS, "work has too few tiles to add a set to the sum of the others");
-
-struct Panel {
-  Image ahead;   // values with momentum, used to evaluate the rays
-  Image moved;   // values with momentum after the step
-  Image before;  // values without momentum
-  Image last;    // values without momentum after the step; the same image as `before`, except in the first step, where
-                 // `before` is `ahead`
-};
-
-struct Problem {
-  int32_t panels, sets, channels;
-  int32_t height, width;           // size of a set
-  int32_t turns;                   // sets take turns from one picture row to the next: row r of a set is picture row
-  int32_t turn[MAX_SETS];          // r * turns + turn
-  const double *panels_from_rays;  // (sets, panels, 3, 3) homographies from a set's rays to panel pixels
-  const double *rays_from_panels;  // (sets, panels, 3, 3) inverses of these homographies
-  const uint8_t *targets[MAX_SETS];  // for each set, its picture (rows of all turns, width, channels)
-  const int16_t *column_taper;     // (width, channels) weights for the rays' errors; 32767 stands for 1
-  const int16_t *row_taper;        // (rows of all turns) further weights
-  const int32_t *table;            // (256,) the sum of panel values plus 65536 times the weight, for each target code
-  float rest, missing;             // for close_middle: value outside the panels, and weight for rays that miss a panel
-  Panel panel[MAX_PANELS];
-  int32_t grey[MAX_PANELS];  // for each panel, 1 if it has one value for all channels (no colour filters)
-  float size, momentum, floor;
-
-  int row(int set, int r) const { return r * turns + turn[set]; }
-  const uint8_t *target(int set, int r, int64_t at) const {
-    return targets[set] + int64_t(row(set, r)) * width * channels + at;
-  }
-  // Return how often to halve what is summed over the sets, so that the sums fit in 16 bits. Four squared slopes, each
-  // at most 7830, or four residuals fit.
-  int halvings() const { return sets <= 4 ? 0 : sets <= 8 ? 1 : 2; }
-};
-
-// Return true if the arguments describe a problem that the loops can solve.
-bool solvable(const Problem &problem, int part, int parts) {
-  if (problem.panels < 2 || problem.panels > MAX_PANELS || problem.sets < 1 || problem.sets > MAX_SETS) return false;
-  if (problem.turns < 1 || (problem.channels != 1 && problem.channels != 3)) return false;
-  for (int set = 0; set < problem.sets; ++set)
-    if (problem.turn[set] < 0 || problem.turn[set] >= problem.turns) return false;
-  if (problem.height < 1 || problem.width < 1 || part < 0 || part >= parts) return false;
-  for (int n = 0; n < problem.panels; ++n)
-    if (problem.panel[n].ahead.rows < 1 || problem.panel[n].ahead.width < 1) return false;
-  const int64_t count = problem.sets * problem.panels;
-  return usable(problem.panels_from_rays, count) && usable(problem.rays_from_panels, count);
-}
 
 // The part of the work done by one thread: rows of rays, and the panel rows that can be updated once they are done.
 struct Share {
@@ -91,7 +41,7 @@ Range rays_through(const Problem &problem, int n, int q) {
   constexpr double everywhere = 1e9, horizon = 1e-6;
   Range rays{everywhere, -everywhere};
   for (int set = 0; set < problem.sets; ++set) {
-    const Line line(problem.rays_from_panels + (set * problem.panels + n) * 9, q);
+    const Line line(problem.rays_from_panels.data() + (set * problem.panels + n) * 9, q);
     if (!(std::min(line.w0 - 0.5 * line.wu, line.w0 + right * line.wu) > horizon)) return {-everywhere, everywhere};
     const double top = line.y(-0.5), bottom = line.y(right), run = std::abs(line.x(right) - line.x(-0.5));
     const double margin = 2 * std::abs(bottom - top) / std::max(run, 0.5);  // extends the line by two pixels
@@ -234,12 +184,12 @@ INLINE void compare(const Problem &problem, const Share &share, int set, int r, 
   Line lines[N];
   Span span{0, problem.width};
   for (int n = 0; n < N; ++n) {
-    lines[n] = Line(problem.panels_from_rays + (set * N + n) * 9, r);
+    lines[n] = Line(problem.panels_from_rays.data() + (set * N + n) * 9, r);
     span = common(span, inside(lines[n], problem.width, problem.panel[n].ahead, NEAR_PX));
   }
   const int16_t one = rounded(unit_of(N)), twice = rounded(512.0f / 255 * unit_of(N));
   const int halvings = problem.halvings();
-  const int16_t row_taper = int16_t(problem.row_taper[problem.row(set, r)] >> halvings);
+  const int16_t row_taper = int16_t(problem.rays->row_taper[problem.row(set, r)] >> halvings);
   const int16_t a = halvings < 2 ? 2 : 1, b = halvings < 1 ? 2 : 1;  // factors of the squared slope
   int tile = TILE_PX;
   for (const Line &line : lines) tile = std::min(tile, tile_px(line, span));
@@ -251,7 +201,7 @@ INLINE void compare(const Problem &problem, const Share &share, int set, int r, 
     }
     const int64_t at = int64_t(u) * C;
     const uint8_t *target = problem.target(set, r, at);
-    const int16_t *taper = problem.column_taper + at;
+    const int16_t *taper = problem.rays->column_taper.data() + at;
     int16_t *curvature = share.row(set, 0, r) + at, *gradient = share.row(set, 1, r) + at;
     for (int e = 0; e < count; e += LANES)
       VECTORISED for (int k = e; k < e + LANES; ++k) {
@@ -274,7 +224,7 @@ struct Back {
   Span span[MAX_SETS];
   Back(const Problem &problem, const Share &share, int n, int q) {
     for (int set = 0; set < problem.sets; ++set) {
-      line[set] = Line(problem.rays_from_panels + (set * problem.panels + n) * 9, q);
+      line[set] = Line(problem.rays_from_panels.data() + (set * problem.panels + n) * 9, q);
       span[set] = inside(line[set], problem.panel[n].ahead.width, share.image(problem, set, 0), -EDGE_CLAMP_PX);
     }
   }
@@ -315,12 +265,12 @@ INLINE void mean_of_channels(int16_t *row, int64_t count) {
 
 // Update row q of panel n by a gradient step with momentum (L5).
 template <int C, int N>
-INLINE void move(const Problem &problem, const Share &share, int n, int q, Work &work) {
+INLINE void move(const Problem &problem, const Update &update, const Share &share, int n, int q, Work &work) {
   const Panel &panel = problem.panel[n];
   const Back back(problem, share, n, q);
-  const float least = problem.floor * float(problem.sets) * unit_of(N) * unit_of(N) / 8192 / float(1 << problem.halvings());
-  const float size = problem.size * FULL / (N * PI / 2);
-  const int16_t momentum = rounded(32768 * problem.momentum);
+  const float least = update.floor * float(problem.sets) * unit_of(N) * unit_of(N) / 8192 / float(1 << problem.halvings());
+  const float size = update.size * FULL / (N * PI / 2);
+  const int16_t momentum = rounded(32768 * update.momentum);
   for (int u = 0; u < panel.ahead.width; u += TILE_PX) {
     const Span tile{u, std::min(u + TILE_PX, panel.ahead.width)};
     gather<2, C>(problem, share, back, tile, work);
@@ -343,7 +293,10 @@ INLINE void move(const Problem &problem, const Share &share, int n, int q, Work 
 template <int C>
 INLINE void residual(const Problem &problem, const Share &share, int set, int r, Work &work) {
   const int middle = problem.panels / 2, halvings = problem.halvings();
-  const double *homographies = problem.panels_from_rays + set * problem.panels * 9;
+  const int32_t *table = problem.rays->table.data();
+  const int16_t rest = int16_t(problem.rays->rest);
+  const float missing = problem.rays->missing;
+  const double *homographies = problem.panels_from_rays.data() + set * problem.panels * 9;
   const Span span = inside(Line(homographies + middle * 9, r), problem.width, problem.panel[middle].last, 0);
   Span whole = span;  // rays that cross all panels
   for (int n = 0; n < problem.panels; ++n)
@@ -360,7 +313,7 @@ INLINE void residual(const Problem &problem, const Share &share, int set, int r,
       int16_t *one = work.tile[0], *begin = one + std::max(seen.first - u, 0) * C, *end = one + std::max(seen.last - u, 0) * C;
       for (int v = seen.first, length = tile_px(line, seen); v < seen.last; v += length)
         sample<1, C>(&problem.panel[n].last, line, v, std::min(v + length, seen.last), work, work.tile, (v - u) * C);
-      std::fill(one, begin, int16_t(problem.rest)), std::fill(end, one + count, int16_t(problem.rest));
+      std::fill(one, begin, rest), std::fill(end, one + count, rest);
       for (int e = 0; e < count; e += LANES)
         VECTORISED for (int k = e; k < e + LANES; ++k) sum[k] = int16_t(sum[k] + one[k]);
     }
@@ -369,13 +322,13 @@ INLINE void residual(const Problem &problem, const Share &share, int set, int r,
     int16_t *weights = share.row(set, 0, r) + at, *weighted = share.row(set, 1, r) + at;
     for (int e = 0; e < count; e += LANES)
       VECTORISED for (int k = e; k < e + LANES; ++k) {
-        const int32_t entry = problem.table[target[k]];
+        const int32_t entry = table[target[k]];
         const int16_t left = int16_t(int16_t(entry) - sum[k]);
         sum[k] = std::min(std::max(left, int16_t(-FULL)), int16_t(2 * FULL)), weights[k] = int16_t(entry >> (16 + halvings));
       }
     const int begin = std::clamp((whole.first - u) * C, 0, count), end = std::clamp((whole.last - u) * C, begin, count);
-    for (int k = 0; k < begin; ++k) weights[k] = rounded(float(weights[k]) * problem.missing);
-    for (int k = end; k < count; ++k) weights[k] = rounded(float(weights[k]) * problem.missing);
+    for (int k = 0; k < begin; ++k) weights[k] = rounded(float(weights[k]) * missing);
+    for (int k = end; k < count; ++k) weights[k] = rounded(float(weights[k]) * missing);
     for (int e = 0; e < count; e += LANES)
       VECTORISED for (int k = e; k < e + LANES; ++k) weighted[k] = product(int16_t(2 * sum[k]), int16_t(2 * weights[k]));
   }
@@ -387,6 +340,7 @@ INLINE void residual(const Problem &problem, const Share &share, int set, int r,
 template <int C>
 INLINE void fill(const Problem &problem, const Share &share, int q, Work &work) {
   const Image &image = problem.panel[problem.panels / 2].last;
+  const int16_t rest = int16_t(problem.rays->rest);
   const Back back(problem, share, problem.panels / 2, q);
   for (int u = 0; u < image.width; u += TILE_PX) {
     const Span tile{u, std::min(u + TILE_PX, image.width)};
@@ -396,13 +350,13 @@ INLINE void fill(const Problem &problem, const Share &share, int q, Work &work) 
     int16_t *out = const_cast<int16_t *>(image.row(q)) + int64_t(u) * C;
     VECTORISED for (int k = 0; k < (tile.last - u) * C; ++k) {
       const float weight = work.tile[0][k], mean = 8192 * float(work.tile[1][k]) / std::max(weight, 1.0f);
-      out[k] = weight > 0 ? rounded(std::min(std::max(mean, 0.0f), float(FULL))) : int16_t(problem.rest);
+      out[k] = weight > 0 ? rounded(std::min(std::max(mean, 0.0f), float(FULL))) : rest;
     }
   }
 }
 
 template <int C, int N>
-INLINE void step_rows(const Problem &problem, const Share &share) {
+INLINE void step_rows(const Problem &problem, const Update &update, const Share &share) {
   Work work{};
   int at[N], ready[N];  // for each panel, the next row to update, and the next to convert to phasors
   std::copy(share.panel_first, share.panel_first + N, at);
@@ -414,7 +368,7 @@ INLINE void step_rows(const Problem &problem, const Share &share) {
         to_phasors(problem, share, n, ready[n]);
     for (int set = 0; set < problem.sets; ++set) compare<C, N>(problem, share, set, r, work);
     for (int n = 0; n < N; ++n)
-      while (at[n] < share.panel_end[n] && share.until[n][at[n]] <= r) move<C, N>(problem, share, n, at[n]++, work);
+      while (at[n] < share.panel_end[n] && share.until[n][at[n]] <= r) move<C, N>(problem, update, share, n, at[n]++, work);
   }
 }
 
@@ -429,59 +383,78 @@ INLINE void close_rows(const Problem &problem, const Share &share) {
   }
 }
 
+INLINE void step_any(const Problem &problem, const Update &update, int part, int parts) {
+  const Share share = share_of(problem, part, parts, true);
+  switch (problem.channels * 10 + problem.panels) {
+    case 12: return step_rows<1, 2>(problem, update, share);
+    case 13: return step_rows<1, 3>(problem, update, share);
+    case 14: return step_rows<1, 4>(problem, update, share);
+    case 15: return step_rows<1, 5>(problem, update, share);
+    case 16: return step_rows<1, 6>(problem, update, share);
+    case 32: return step_rows<3, 2>(problem, update, share);
+    case 33: return step_rows<3, 3>(problem, update, share);
+    case 34: return step_rows<3, 4>(problem, update, share);
+    case 35: return step_rows<3, 5>(problem, update, share);
+    case 36: return step_rows<3, 6>(problem, update, share);
+  }
+}
+
+INLINE void close_middle_any(const Problem &problem, int part, int parts) {
+  const Share share = share_of(problem, part, parts, false);
+  if (problem.channels == 3) close_rows<3>(problem, share);
+  else close_rows<1>(problem, share);
+}
+
+INLINE void show_any(const int16_t *row, int channels, uint32_t *pixels, int count) {
+  if (channels == 1) {
+    VECTORISED for (int u = 0; u < count; ++u) pixels[u] = uint32_t((row[u] + 8) >> 4) * 0x10101u | 0xff000000u;
+    return;
+  }
+  VECTORISED for (int u = 0; u < count; ++u) {
+    const uint32_t red = uint32_t(row[3 * u] + 8) >> 4, green = uint32_t(row[3 * u + 1] + 8) >> 4;
+    pixels[u] = red | green << 8 | (uint32_t(row[3 * u + 2] + 8) >> 4) << 16 | 0xff000000u;
+  }
+}
+
 }  // namespace
 
-// Run part number `part` of a step divided into `parts` independent parts.
-FOR_EVERY_CPU int32_t step(const Problem *problem, int part, int parts) {
-  if (!solvable(*problem, part, parts)) return UNUSABLE;
-  try {
-    const Share share = share_of(*problem, part, parts, true);
-    switch (problem->channels * 10 + problem->panels) {
-      case 12: step_rows<1, 2>(*problem, share); break;
-      case 13: step_rows<1, 3>(*problem, share); break;
-      case 14: step_rows<1, 4>(*problem, share); break;
-      case 15: step_rows<1, 5>(*problem, share); break;
-      case 16: step_rows<1, 6>(*problem, share); break;
-      case 32: step_rows<3, 2>(*problem, share); break;
-      case 33: step_rows<3, 3>(*problem, share); break;
-      case 34: step_rows<3, 4>(*problem, share); break;
-      case 35: step_rows<3, 5>(*problem, share); break;
-      case 36: step_rows<3, 6>(*problem, share); break;
-    }
-    return DONE;
-  } catch (const std::exception &) {  // bad_alloc or length_error
-    return NO_MEMORY;
+FOR_EVERY_LEVEL(step, void, (const Problem &problem, const Update &update, int part, int parts), (problem, update, part, parts))
+FOR_EVERY_LEVEL(close_middle, void, (const Problem &problem, int part, int parts), (problem, part, parts))
+FOR_EVERY_LEVEL(show, void, (const int16_t *row, int channels, uint32_t *pixels, int count), (row, channels, pixels, count))
+
+Panels::Panels(int count, int rows, int columns, int channels)
+    : count(count), rows(rows), columns(columns), channels(channels) {
+  require(count >= 2 && count <= MAX_PANELS, "a solution must have 2 to 6 panels");
+  require(rows >= 1 && columns >= 1 && rows <= MAX_SIDE && columns <= MAX_SIDE, "a panel's size is out of range");
+  require(channels == 1 || channels == 3, "there must be 1 or 3 channels");
+  stride = whole_vectors(int64_t(columns) * channels) + MARGIN;
+  for (auto &buffer : buffers) {
+    buffer.reset(static_cast<int16_t *>(std::calloc(size_t(count) * (rows + 1) * stride, sizeof(int16_t))));
+    if (!buffer) throw std::bad_alloc();
   }
 }
 
-// Solve the middle panel (`last`) with the other panels held fixed. The work is divided into `parts` independent parts,
-// and this call does part number `part`.
-FOR_EVERY_CPU int32_t close_middle(const Problem *problem, int part, int parts) {
-  if (!solvable(*problem, part, parts)) return UNUSABLE;
-  try {
-    const Share share = share_of(*problem, part, parts, false);
-    if (problem->channels == 3) close_rows<3>(*problem, share);
-    else close_rows<1>(*problem, share);
-    return DONE;
-  } catch (const std::exception &) {
-    return NO_MEMORY;
+Problem::Problem(const Panels &given, bool closing, std::shared_ptr<const Rays> of_rays, std::vector<Size> boxes, std::vector<double> seen, std::vector<double> back, std::vector<RaySet> ray_sets, int turns, std::vector<bool> of_grey)
+    : rays(std::move(of_rays)), panels(given.count), sets(int(ray_sets.size())), channels(given.channels),
+      width(rays->width), turns(turns), ray_set(std::move(ray_sets)), panels_from_rays(std::move(seen)),
+      rays_from_panels(std::move(back)), grey(std::move(of_grey)) {
+  require(rays->channels == channels, "the targets and the panels have different numbers of channels");
+  require(sets >= 1 && sets <= MAX_SETS, "the number of ray sets is out of range");
+  require(turns >= 1 && turns <= rays->rows, "more sets take turns than there are rows of rays");
+  height = rays->rows / turns;
+  for (const RaySet &set : ray_set)
+    require(set.view >= 0 && set.view < int(rays->targets.size()) && set.turn >= 0 && set.turn < turns, "a ray set has no picture or turn");
+  require(int(boxes.size()) == panels && int(grey.size()) == panels, "each panel must have a box, and be grey or not");
+  const int64_t entries = int64_t(sets) * panels * 9;
+  require(int64_t(panels_from_rays.size()) == entries && int64_t(rays_from_panels.size()) == entries,
+          "each ray set must have a homography and its inverse for each panel");
+  require(usable(panels_from_rays.data(), entries / 9) && usable(rays_from_panels.data(), entries / 9),
+          "a homography is not finite");
+  const Panels::Roles roles = closing ? Panels::Roles{given.ahead, given.last, given.moved, given.last} : given.roles();
+  for (int n = 0; n < panels; ++n) {
+    const auto [rows, columns] = boxes[n];
+    require(rows >= 1 && columns >= 1 && rows <= given.rows && columns <= given.columns, "a box is larger than its panel");
+    const auto image = [&](int buffer) { return Image{given.row(buffer, n, 0), given.stride, rows, columns, rows}; };
+    panel[n] = {image(roles.ahead), image(roles.moved), image(roles.before), image(roles.last)};
   }
 }
-
-// Convert a panel's rows from `first` to `end` - 1 to opaque RGBA pixels with 8-bit codes.
-FOR_EVERY_CPU void show(const Image *panel, int channels, uint32_t *pixels, int64_t stride, int first, int end) {
-  for (int r = first; r < end; ++r) {
-    const int16_t *row = panel->row(r);
-    uint32_t *to = pixels + r * stride;
-    if (channels == 1) {
-      VECTORISED for (int u = 0; u < panel->width; ++u) to[u] = uint32_t((row[u] + 8) >> 4) * 0x10101u | 0xff000000u;
-      continue;
-    }
-    VECTORISED for (int u = 0; u < panel->width; ++u) {
-      const uint32_t red = uint32_t(row[3 * u] + 8) >> 4, green = uint32_t(row[3 * u + 1] + 8) >> 4;
-      to[u] = red | green << 8 | (uint32_t(row[3 * u + 2] + 8) >> 4) << 16 | 0xff000000u;
-    }
-  }
-}
-
-extern "C" { extern const int32_t problem_bytes = sizeof(Problem), max_sets = MAX_SETS; }

@@ -1,24 +1,11 @@
 // Resample an image to another raster through a homography. The image's and the raster's columns may be unevenly spaced
 // (ColumnLaw in runtime/model/chain.py).
-#include "sampling.hpp"
+#include "loops.hpp"
 
 namespace {
 
 constexpr int BENT_TILE_PX = 64;   // maximum length of a tile with unevenly spaced columns, for a close enough parabola
 constexpr int SOURCE_PX = 480;     // maximum width of a tile's source; columns are wide at the end of a column law
-constexpr double BEYOND = 1e-9;    // minimum argument for the logarithm; no column corresponds to smaller arguments
-
-struct Columns {  // for column u, the homography applies to t = middle + (1 - exp(-bend (u - middle))) / bend
-  double bend, middle;
-  double to(double u) const { return bend == 0 ? u : middle - std::expm1(-bend * (u - middle)) / bend; }
-  double from(double t) const { return bend == 0 ? t : middle - std::log(std::max(1 - bend * (t - middle), BEYOND)) / bend; }
-};
-
-struct Warp {
-  double image_from_raster[9];
-  Columns image, raster;
-  double reach_px;  // how far outwards the image's edge is repeated; less than EDGE_PX
-};
 
 struct WarpedLine {
   Line line;  // maps evenly spaced columns (t)
@@ -66,18 +53,28 @@ INLINE void warp_rows(const Image &image, const Image &result, const Warp &warp,
   }
 }
 
-}  // namespace
-
-// Sample the result's rows bilinearly from an image whose elements are within ±8191. Result pixels outside the image
-// are set to `outside`.
-FOR_EVERY_CPU int32_t warp(const Image *image, const Image *result, const Warp *by, int channels, int outside, int first, int end) {
-  const double law[] = {by->image.bend, by->image.middle, by->raster.bend, by->raster.middle};
-  if (!usable(by->image_from_raster, 1) || !std::all_of(law, law + 4, [](double x) { return std::abs(x) < 1e9; })) return UNUSABLE;
-  if ((channels != 1 && channels != 3) || image->rows < 1 || image->width < 1 || result->width < 0) return UNUSABLE;
-  if (first < 0 || end > result->rows || !(by->reach_px >= -1e9 && by->reach_px <= EDGE_PX - 1)) return UNUSABLE;
-  if (channels == 3) warp_rows<3>(*image, *result, *by, outside, first, end);
-  else warp_rows<1>(*image, *result, *by, outside, first, end);
-  return DONE;
+INLINE void warp_image_any(const Image &image, int channels, const Image &result, const Warp &by, int outside, int begin, int end) {
+  if (channels == 3) warp_rows<3>(image, result, by, outside, begin, end);
+  else warp_rows<1>(image, result, by, outside, begin, end);
 }
 
-extern "C" { extern const int32_t warp_bytes = sizeof(Warp); }
+}  // namespace
+
+FOR_EVERY_LEVEL(warp_image, void, (const Image &image, int channels, const Image &result, const Warp &by, int outside, int begin, int end), (image, channels, result, by, outside, begin, end))
+
+Source::Source(const int16_t *pixels, int rows, int width, int channels) : channels(channels) {
+  require(rows >= 1 && width >= 1 && (channels == 1 || channels == 3), "an image must have rows, columns and 1 or 3 channels");
+  const int64_t elements = int64_t(rows) * width * channels;
+  memory.resize(size_t(elements + 2 * LANES));
+  for (int64_t k = 0; k < elements; ++k) memory[k] = std::min(std::max(pixels[k], int16_t(-LARGEST)), LARGEST);
+  image = {memory.data(), int64_t(width) * channels, rows, width, rows};
+}
+
+void Source::warp(const Image &result, const Warp &by, int outside, int begin, int end) const {
+  const double law[] = {by.image.bend, by.image.middle, by.raster.bend, by.raster.middle};
+  require(usable(by.image_from_raster, 1), "a homography is not finite");
+  require(std::all_of(law, law + 4, [](double x) { return std::abs(x) < 1e9; }), "a column law is not finite");
+  require(by.reach_px > -1e9 && by.reach_px <= EDGE_PX - 1, "an image's edge can be repeated over at most 3 pixels");
+  require(0 <= begin && begin <= end && end <= result.rows, "there are no such rows");
+  warp_image(image, channels, result, by, outside, begin, end);
+}

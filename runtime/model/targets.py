@@ -7,7 +7,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from runtime.kernels import FULL, SUBCODE, with_margin
+from runtime.kernels import FULL, SUBCODE
 from runtime.optics.malus import Branch, phase_from_intensity, rest_code, rest_value
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, I16, U8
@@ -84,19 +84,10 @@ def is_grey(picture: U8) -> bool:
 
 
 def without_alpha(picture: U8, channels: int) -> U8:
-    """Return a contiguous (h, w, 3) picture or, if `channels` is 1, only its first channel (h, w).
-
-    The kernels may read past its end (`with_margin`).
-    """
-    size = picture.shape[:2]
-    codes: U8 = with_margin(size if channels == 1 else (*size, 3), np.uint8)
+    """Return an (h, w, 3) picture or, if `channels` is 1, its first channel (h, w). Rows may be apart in memory."""
     if channels == 1:
-        cv2.extractChannel(picture, 0, dst=codes)
-    elif picture.shape[2] == 3:
-        np.copyto(codes, picture)
-    else:
-        cv2.cvtColor(picture, cv2.COLOR_RGBA2RGB, dst=codes)
-    return codes
+        return np.asarray(cv2.extractChannel(picture, 0), np.uint8)
+    return picture if picture.shape[2] == 3 else np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGBA2RGB), np.uint8)
 
 
 def flat_layers(image: U8, stack: PanelStack) -> U8:

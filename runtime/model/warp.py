@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from ctypes import byref, c_double
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.kernels import EDGE_PX, KernelImage, Warp, library, with_margin
+from runtime.kernels import EDGE_PX, library
 from runtime.model.chain import EVEN_COLUMNS, ColumnLaw
 from runtime.model.geometry import SNAPPED, TargetView
 from runtime.optics.stack import PlaneRaster, between_pixel_centres
@@ -20,7 +19,6 @@ from runtime.support.threads import on_rows
 # further would add no information.
 LEAST_PX, MIN_SCALE = 16, 0.25
 REACH_PX = EDGE_PX - 1.0  # maximum distance that an image's edge is repeated outwards
-LARGEST = 8191  # largest absolute value that the compiled loop can sample
 _TRANSPOSED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
@@ -112,7 +110,7 @@ def warp(
     """Resample an (h, w[, 3]) int16 image as `resample` does, but several times as fast.
 
     Args:
-        image: Image to resample. Its values are clipped to ±LARGEST.
+        image: Image to resample. Its values are clipped to ±8191.
         image_from_result: 3x3 homography from the result's columns and rows to the image's. For both, columns are given
             by the coordinate t that their column law defines (`ColumnLaw`).
         size: Number of rows and columns in the result.
@@ -135,15 +133,10 @@ def warp(
         image = np.asarray(cv2.flip(np.ascontiguousarray(image), 1), np.int16)
         image_from_result = np.array([[-1.0, 0.0, width_px], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]) @ image_from_result
         image_columns = image_columns.mirrored(width_px)
-    source: I16 = with_margin(image.shape, np.int16)
-    np.clip(image, -LARGEST, LARGEST, out=source)
-    result = np.empty((*size, *image.shape[2:]), np.int16)
-    channels = result.shape[2] if result.ndim == 3 else 1
-    laws = image_columns.bend, image_columns.middle, result_columns.bend, result_columns.middle
-    by = Warp((c_double * 9)(*image_from_result.ravel()), *laws, reach_px)
-    images = [KernelImage.of(x.reshape(len(x), -1), rows=x.shape[0], width=x.shape[1]) for x in (source, result)]
-    loops, arguments = library(), [byref(argument) for argument in (*images, by)]
-    on_rows(lambda first, end: loops.warp(*arguments, channels, outside, first, end), size[0], threads=threads)
+    source, result = library().Source(np.ascontiguousarray(image)), np.empty((*size, *image.shape[2:]), np.int16)
+    laws = (image_columns.bend, image_columns.middle), (result_columns.bend, result_columns.middle)
+    matrix = np.ascontiguousarray(image_from_result, np.float64)
+    on_rows(lambda *rows: source.warp(result, matrix, *laws, reach_px, outside, rows), size[0], threads=threads)
     return np.ascontiguousarray(np.swapaxes(result, 0, 1)) if turned else result
 
 

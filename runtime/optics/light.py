@@ -15,7 +15,6 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from ctypes import byref
 from typing import NamedTuple
 
 import numpy as np
@@ -109,21 +108,12 @@ def _squared_error(
     codes: U8, view: LightView, table: F32, sampling: Sampling, first: int, last: int
 ) -> tuple[float, int]:
     """Return the sum of squared errors over the rows from `first` to `last` - 1, and the number of terms."""
-    count, height, width, components = codes.shape
-    target, table = np.ascontiguousarray(view.target, np.float32), np.ascontiguousarray(table, np.float32)
-    matrices = [
-        np.ascontiguousarray(x, np.float64) for x in (view.centre_from_image, view.panels_from_centre, view.toward)
-    ]
-    view_arrays = kernels.KernelView(
-        layers=codes.ctypes.data, panels=count, height=height, width=width, components=components,
-        target=target.ctypes.data, rows=target.shape[0], columns=target.shape[1],
-        centre_from_image=matrices[0].ctypes.data, panels_from_centre=matrices[1].ctypes.data,
-        toward=matrices[2].ctypes.data, table=table.ctypes.data, first_ray=view.first_ray,
-        points=len(view.panels_from_centre), rays=sampling.rays, step=sampling.step,
+    total, counted = kernels.library().squared_error(
+        codes, np.ascontiguousarray(view.target, np.float32),
+        *(np.ascontiguousarray(x, np.float64) for x in (view.centre_from_image, view.panels_from_centre, view.toward)),
+        np.ascontiguousarray(table, np.float32), (view.first_ray, sampling.rays), sampling.step, (first, last),
     )  # fmt: skip
-    result = kernels.ErrorSum()
-    kernels.library().squared_error(byref(view_arrays), first, last, byref(result))
-    return result.total, result.counted
+    return total, counted
 
 
 def view_of(

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.config import PanelSettings
-from runtime.kernels import CURVE_ENTRIES, CURVE_STEPS, ScaleShift, ShownPanel, library
+from runtime.kernels import CURVE_ENTRIES, CURVE_STEPS, ScaleShift, ShownPanel, panel_loops
 from runtime.optics.malus import rest_code
 from runtime.optics.presentation import Interpolation, Mount, PanelDraw, PixelMap, on_layer, panel_draws
 from runtime.optics.rect import PixelRect, union
@@ -179,7 +179,7 @@ class ProcessorPainter:
                 to_draw.append(shown)
                 parts[panel] = part
         if to_draw:
-            library().draw_panels((ShownPanel * len(to_draw))(*to_draw), len(to_draw), self._threads)
+            panel_loops().draw_panels((ShownPanel * len(to_draw))(*to_draw), len(to_draw), self._threads)
         self._drawn, self._filled = drawn, filled
         return parts
 
@@ -235,7 +235,7 @@ class ProcessorPainter:
         for picture, layer, extended in zip(pictures, turned, extended_px or [0] * len(turned), strict=True):
             rows, columns = layer.shape[:2]
             box = (ctypes.c_int32 * 4)()
-            library().frame_picture(
+            panel_loops().frame_picture(
                 layer.ctypes.data, *layer.strides[:2], rows, columns, picture.ctypes.data, border_px, extended, box
             )
             boxes.append(PixelRect(*box))

@@ -1,19 +1,20 @@
-"""The compiled loops: Python's copies of their constants, and the same panels from every instruction set."""
+"""The compiled loops: any geometry, arrays of any size, and the same panels from every instruction set."""
 
 from __future__ import annotations
 
 import ctypes
+import mmap
 import os
 import re
 import resource
-import subprocess
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from runtime import kernels
 from runtime.errors import MissingPart
@@ -28,16 +29,10 @@ from tests.model.scenes import eyes
 from tests.model.test_steps import STACK, STACKS, begun, panels_of
 
 ROOT = Path(__file__).parents[2]
-NEEDS = {
-    "x86_64_v4": {"avx512f", "avx512bw", "avx512vl", "avx512dq"},
-    "x86_64_v3": {"avx2", "fma", "bmi2"},
-    "default": set(),
-}
 
 
-@pytest.mark.parametrize("name", ["problem_bytes", "warp_bytes", "view_bytes", "max_sets"])
-def test_kernels_of_another_layout_or_limit_are_refused(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(kernels.COMPILED, name, kernels.COMPILED[name] + 1)
+def test_kernels_of_another_version_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kernels, "INTERFACE", kernels.INTERFACE + 1)
     kernels.library.cache_clear()
     with pytest.raises(MissingPart, match="was built from another version"):
         load_predictor("sart", STACK)
@@ -45,59 +40,109 @@ def test_kernels_of_another_layout_or_limit_are_refused(name: str, monkeypatch: 
     kernels.library()
 
 
-def clones(instructions: str) -> Any:
-    """The compiled loops for one instruction set, which the loader would choose on another processor."""
-    built = kernels.library()
-    table = subprocess.run(["nm", built._name], capture_output=True, text=True, check=True).stdout
-    offsets = {row.split()[-1]: int(row.split()[0], 16) for row in table.splitlines() if row[0] == "0"}
-    begin = ctypes.addressof(ctypes.c_int32.in_dll(built, "problem_bytes")) - offsets["problem_bytes"]
-    suffix = instructions if instructions == "default" else f"arch_{instructions}"
-    return SimpleNamespace(
-        **{
-            name: ctypes.CFUNCTYPE(None, *getattr(built, name).argtypes)(begin + offsets[f"{name}.{suffix}"])
-            for name in ("step", "close_middle", "show")
-        }
-    )
-
-
-def usable_sets() -> list[str]:
-    """Instruction sets of this machine that the loops were compiled for, the best first."""
-    flags = re.search(r"^flags\s*:(.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
-    has = set(flags[1].split()) if flags else set()
-    return [name for name, needs in NEEDS.items() if needs <= has]
+@pytest.fixture
+def any_level() -> Iterator[None]:
+    yield
+    kernels.library().use_level(kernels.library().levels()[0])
 
 
 @pytest.mark.parametrize("stack", ["three", "tilted", "four"])
 @pytest.mark.parametrize("channels", [1, 3])
-def test_every_instruction_set_makes_the_same_panels(
-    stack: str, channels: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.usefixtures("any_level")
+def test_every_instruction_set_makes_the_same_panels(stack: str, channels: int) -> None:
     """To the byte, although AVX-512 and AVX2 round a product and its sum once, and the plain build twice."""
-    made, sets = [], usable_sets()
-    if len(sets) < 2:
-        pytest.skip("this machine has one instruction set only")
-    for instructions in sets:
-        loops = clones(instructions)
-        monkeypatch.setattr(cpu, "library", lambda loops=loops: loops)
+    made, levels = [], kernels.library().levels()
+    if len(levels) < 2:
+        pytest.skip("this machine or build has one level only")
+    for level in levels:
+        kernels.library().use_level(level)
         state, _, geometry = begun(STACKS[stack], eyes(0.4, 0.2, roll_deg=10), own=True, channels=channels)
         state.close_middle()
         for places in ("rising", "middle", "falling"):
             state.step(Step(size=1.4, places=places))
         buffer = LayerPool(STACKS[stack]).take()
         state.write(buffer, 128)
-        made.append((np.concatenate([panel.ravel() for panel in panels_of(state, geometry, channels)]), buffer.pixels))
+        made.append((np.concatenate([panel.ravel() for panel in panels_of(state, geometry)]), buffer.pixels))
     for panels, layers in made[1:]:
         assert np.abs(panels - made[0][0]).max() == 0 and (layers == made[0][1]).all()
 
 
+def guarded(array: NDArray[Any]) -> NDArray[Any]:
+    """A copy whose last byte is the last of readable memory."""
+    page = mmap.PAGESIZE
+    size = -(-array.nbytes // page) * page
+    memory = mmap.mmap(-1, size + page)
+    place = ctypes.addressof(ctypes.c_char.from_buffer(memory))
+    assert ctypes.CDLL(None).mprotect(ctypes.c_void_p(place + size), page, 0) == 0
+    flat = np.frombuffer(memory, array.dtype, array.size, size - array.nbytes)
+    flat[:] = array.ravel()
+    return flat.reshape(array.shape)
+
+
 @pytest.mark.parametrize("channels", [1, 3])
-@pytest.mark.parametrize("own", [True, False])
-def test_whatever_the_loops_read_in_whole_vectors_has_a_margin(channels: int, own: bool) -> None:
+@pytest.mark.parametrize("width", [1, 31, 33, 100])
+def test_nothing_is_read_or_written_past_an_array_s_end(channels: int, width: int) -> None:
     """A read past the last page of a thread's memory ended the process."""
-    state, _, _ = begun(STACKS["three"], eyes(0.4, 0.2), own=own, channels=channels)
-    for array in (*state._targets, state._tapers[0]):
-        assert array.flags.c_contiguous
-        assert array.base is not None and array.base.size >= array.size + kernels.MARGIN
+    loops, rows, rng = kernels.library(), 5, np.random.default_rng(0)
+    shape = (rows, width) if channels == 1 else (rows, width, 3)
+    pictures = [guarded(rng.integers(0, 256, shape, np.uint8)) for _ in range(2)]
+    tapers = guarded(np.full(width, 32767, np.int16)), guarded(np.full(rows, 32767, np.int16))
+    rays = loops.Rays(pictures, *tapers, guarded(np.arange(256, dtype=np.int32) * 16 + (8191 << 16)), 2040.0, 0.5)
+    panels = loops.Panels(2, rows, width, channels)
+    for n in range(2):
+        panels.set(n, guarded(rng.integers(0, 4081, shape, np.int16)))
+    matrices = guarded(np.tile(np.eye(3) + np.array([[0, 0, 0.2], [0, 0, 0.2], [0, 0, 0]]), (2, 2, 1, 1)))
+    back = guarded(np.linalg.inv(matrices))
+    for closing in (True, False):
+        boxes, sets = [(rows, width)] * 2, [(0, 0), (1, 0)]
+        problem = loops.Problem(panels, rays, closing, boxes, matrices, back, sets, 1, [False] * 2)
+        for part in range(2):
+            problem.close_middle(part, 2) if closing else problem.step(1.0, 0.5, 0.01, part, 2)
+    panels.advance()
+    assert panels.values(0, rows, width).std() > 1
+    layers = guarded(np.zeros((rows, width, 4), np.uint8))
+    panels.write(0, 0, 0, layers, 0, rows)
+    assert (layers[..., 3] == 255).all()
+    image, result = guarded(rng.integers(0, 4081, shape, np.int16)), guarded(np.zeros(shape, np.int16))
+    loops.Source(image).warp(result, matrices[0, 0], (0.0, 0.0), (0.0, 0.0), 3.0, -1, (0, rows))
+    assert (result >= 0).all()
+
+
+def test_the_loops_take_only_arrays_that_fit() -> None:
+    loops = kernels.library()
+    panels = loops.Panels(3, 20, 30, 3)
+    picture, taper = np.zeros((20, 30, 3), np.uint8), np.zeros(30, np.int16)
+    rows, table = np.zeros(20, np.int16), np.zeros(256, np.int32)
+    rays = loops.Rays([picture, picture], taper, rows, table, 0.0, 1.0)
+    matrices = np.tile(np.eye(3), (2, 3, 1, 1))
+    boxes, sets, grey = [(20, 30)] * 3, [(0, 0), (1, 0)], [False] * 3
+    closing = loops.Problem(panels, rays, True, boxes, matrices, matrices, sets, 1, grey)
+    wrong: list[tuple[type[Exception], Callable[[], Any]]] = [
+        (ValueError, lambda: loops.Panels(9, 20, 30, 3)),
+        (ValueError, lambda: loops.Panels(3, 20, 30, 2)),
+        (ValueError, lambda: panels.fill(3, 1, 1, 0)),
+        (ValueError, lambda: panels.fill(0, 21, 1, 0)),
+        (ValueError, lambda: panels.set(0, np.zeros((20, 31, 3), np.int16))),
+        (ValueError, lambda: panels.set(0, np.zeros((20, 30), np.int16))),
+        (TypeError, lambda: panels.set(0, np.zeros((20, 30, 3), np.int32))),
+        (TypeError, lambda: panels.set(0, np.zeros((20, 30, 3), np.int16)[:, ::-1])),
+        (ValueError, lambda: panels.write(0, 1, 0, np.zeros((20, 30, 4), np.uint8), 0, 20)),
+        (ValueError, lambda: panels.write(0, 0, 0, np.zeros((20, 30, 4), np.uint8), 0, 21)),
+        (ValueError, lambda: loops.Rays([picture, picture[1:]], taper, rows, table, 0.0, 1.0)),
+        (ValueError, lambda: loops.Rays([picture[:, ::2]] * 2, taper[::2].copy(), rows, table, 0.0, 1.0)),
+        (ValueError, lambda: loops.Rays([picture, picture], taper[1:], rows, table, 0.0, 1.0)),
+        (ValueError, lambda: loops.Problem(panels, rays, False, boxes[1:], matrices, matrices, sets, 1, grey)),
+        (ValueError, lambda: loops.Problem(panels, rays, False, [(21, 30)] * 3, matrices, matrices, sets, 1, grey)),
+        (ValueError, lambda: loops.Problem(panels, rays, False, boxes, matrices[:1], matrices, sets, 1, grey)),
+        (ValueError, lambda: loops.Problem(panels, rays, False, boxes, matrices, matrices, [(0, 0), (2, 0)], 1, grey)),
+        (ValueError, lambda: loops.Problem(panels, rays, False, boxes, matrices, matrices, [(0, 0), (1, 1)], 1, grey)),
+        (ValueError, lambda: loops.Problem(panels, rays, False, boxes, matrices, matrices, sets, 21, grey)),
+        (ValueError, lambda: closing.close_middle(2, 2)),
+    ]  # fmt: skip
+    for number, (error, call) in enumerate(wrong):
+        with pytest.raises(error):
+            call()
+            pytest.fail(f"{number} was accepted")
 
 
 TURNS = {
@@ -126,7 +171,7 @@ def test_rays_in_any_order_make_the_same_panels(turn: str, channels: int) -> Non
         state.close_middle()
         state.start()
         state.step(Step(size=1.0, places="middle"))
-        made.append(np.concatenate([panel.ravel() for panel in panels_of(state, geometry, channels)]))
+        made.append(np.concatenate([panel.ravel() for panel in panels_of(state, geometry)]))
     off = np.abs(made[1] - made[0])
     assert off.mean() < 1.5 and np.quantile(off, 0.99) < 8, (off.mean(), np.quantile(off, [0.9, 0.99]))
 

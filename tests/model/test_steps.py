@@ -71,11 +71,9 @@ def begun(
     return state, job, geometry
 
 
-def panels_of(state: CpuState, geometry: Any, channels: int) -> list[Any]:
-    return [
-        state._held.last[n, : box.height_px, : box.width_px * channels].reshape(box.height_px, box.width_px, channels)
-        for n, box in enumerate(geometry.boxes)
-    ]
+def panels_of(state: CpuState, geometry: Any) -> list[Any]:
+    """(rows, columns, channels) values of each panel's box."""
+    return [state._held.values(n, box.height_px, box.width_px) for n, box in enumerate(geometry.boxes)]
 
 
 @pytest.mark.parametrize("stack", STACKS)
@@ -107,7 +105,7 @@ def compare_with_reference(
     # The reference has one size for all panels: each lies in the first corner of the largest.
     height, width = (max(getattr(box, name) for box in boxes) for name in ("height_px", "width_px"))
     last = torch.zeros(count, channels, height, width, dtype=torch.float64)
-    for n, panel in enumerate(panels_of(state, geometry, channels)):
+    for n, panel in enumerate(panels_of(state, geometry)):
         last[n, :, : panel.shape[0], : panel.shape[1]] = torch.from_numpy(panel.astype(np.float64) / FULL).movedim(
             -1, 0
         )
@@ -125,7 +123,7 @@ def compare_with_reference(
         grey = [n for n in range(count) if stack.is_grey(n)]
         last, ahead = step(last, ahead, targets, views, size=size, momentum=0.5, grey=grey)
         state.step(Step(size=size, momentum=0.5, places=places))
-    for n, panel in enumerate(panels_of(state, geometry, channels)):
+    for n, panel in enumerate(panels_of(state, geometry)):
         edge = 0 if alike else 8  # beside a smaller panel the reference sees what is not there
         rows, columns = slice(edge, panel.shape[0] - edge), slice(edge, panel.shape[1] - edge)
         off = np.abs(panel / FULL - last[n, :, : panel.shape[0], : panel.shape[1]].movedim(0, -1).numpy())[
@@ -148,7 +146,7 @@ def test_threads_share_a_step_without_a_trace(pair: F64, own: bool) -> None:
         for places in ("rising", "falling"):
             state.step(Step(size=1.6, places=places))  # type: ignore[arg-type]
         state.close_middle()
-        found.append(panels_of(state, geometry, 3))
+        found.append(panels_of(state, geometry))
     assert all((one == other).all() for one, other in zip(*found, strict=True))
 
 
@@ -165,7 +163,7 @@ def test_the_middle_panel_closes_on_one_eye_s_target(stack: str) -> None:
     wanted = target_table(count)[:, 0][job.views[0].pixels[geometry.rays.slices][..., :3]] - (count - 1) * rest_of(
         count
     )
-    off = np.abs(panels_of(state, geometry, 3)[middle] - np.clip(wanted, 0, FULL))
+    off = np.abs(panels_of(state, geometry)[middle] - np.clip(wanted, 0, FULL))
     assert np.median(off) <= 3
     assert off.max() <= 32  # of rays that miss a panel, which weigh little in 16 bits
 
@@ -178,7 +176,7 @@ def test_a_ray_that_misses_a_panel_leaves_a_pixel_to_the_other_eye() -> None:
     plain = [np.full_like(view.pixels, code) for view, code in zip(job.views, codes, strict=True)]
     state.begin(replace(job, targets=replace(job.targets, views=drawn_views(plain, STACK))), geometry)
     state.close_middle()
-    rays, found = geometry.rays, panels_of(state, geometry, 3)[geometry.middle][..., 0]
+    rays, found = geometry.rays, panels_of(state, geometry)[geometry.middle][..., 0]
     at = np.stack([*np.meshgrid(np.arange(rays.width_px) + 0.5, np.arange(rays.height_px) + 0.5), np.ones(found.shape)])
     crosses = []
     for matrices in geometry.ray_sets("middle", 0.0).panels_from_rays:
@@ -197,9 +195,9 @@ def test_many_steps_with_momentum_do_not_diverge() -> None:
     state, _, geometry = begun(STACK, eyes(0.6), own=True)
     changes = []
     for _ in range(60):
-        before = [panel.copy() for panel in panels_of(state, geometry, 3)]
+        before = [panel.copy() for panel in panels_of(state, geometry)]
         state.step(Step(size=1.3, momentum=0.6))
-        after = panels_of(state, geometry, 3)
+        after = panels_of(state, geometry)
         changes.append(np.mean([np.abs(a.astype(int) - b).mean() for a, b in zip(after, before, strict=True)]))
     assert changes[-1] < 0.05 * changes[0]
 
@@ -237,10 +235,10 @@ def test_equal_grey_pictures_and_panels_that_show_them_stay() -> None:
     state.begin(job, geometry)
     state.close_middle()
     state.start()
-    before = [panel.copy() for panel in panels_of(state, geometry, 3)]
+    before = [panel.copy() for panel in panels_of(state, geometry)]
     for _ in range(3):
         state.step(Step(size=1.6))
-    for panel, old in zip(panels_of(state, geometry, 3), before, strict=True):
+    for panel, old in zip(panels_of(state, geometry), before, strict=True):
         assert np.abs(panel.astype(int) - old).max() <= SUBCODE // 2
 
 
