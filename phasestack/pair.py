@@ -28,6 +28,7 @@ from runtime.evaluation.displayed import SIGMAS_MM, Picture
 from runtime.evaluation.solved import PairQuality, SolvedPair
 from runtime.model.job import VIEWS_MOST
 from runtime.model.predictor import Predictor, load_predictor
+from runtime.model.sart import SartPredictor
 from runtime.model.still import solve_still
 from runtime.optics.cameras import as_cameras, doubts, looking_at_origin
 from runtime.optics.disparity import disparity_doubts
@@ -42,6 +43,9 @@ from runtime.support.progress import ShownProgress
 from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG, SEPARATION_MIN_M, refusal
 
 EVERY_LEAST = 20  # minimum number of pixels to sample along a picture's shorter side
+STEPS_MOST = 1000  # maximum number of steps of a solution
+FAINT_DB = 21.0  # light PSNR below which the eyes see obvious ghosts (as on the viewer page)
+NOTED_EVERY = 8  # every so many pixels and rows are measured for `Result.notes`
 LEAST_APART_M = 0.0005  # minimum distance between two views' eyes if there are more than two
 REAL_PIXELS = 20_000  # pixels of a picture that are measured on real panels, about
 SAME_PLACE_M = 0.001  # maximum distance between an eye and its camera
@@ -77,6 +81,12 @@ class Measuring(TypedDict, total=False):
     every: int  # measure every Nth pixel of every Nth row; 1 measures all pixels
 
 
+class Solving(TypedDict, total=False):
+    """Further options of `solve`."""
+
+    steps: int | None  # number of steps of a solution; None: as many as the model was made for
+
+
 class Result:
     """The layers computed for pictures, one for each eye.
 
@@ -103,15 +113,21 @@ class Result:
         The quality is measured on first access, which may take longer than solving. A warning is issued for each entry
         in `notes`.
         """
-        self._warn()
+        self._warn(self._pair.quality)
         return self._pair.quality
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
-        """Warnings that the eyes will see ghosts, because the pictures have too much disparity for the stack.
+        """Warnings that the eyes will see ghosts, and why if it is known.
 
-        Only two pictures are checked.
+        A reason is that the pictures have too much disparity for the stack, which is checked for two pictures.
         """
+        every = max(1, min(NOTED_EVERY, min(self._asked.pictures[0].shape[:2]) // EVERY_LEAST))
+        light_db = self._pair.sampled(sigmas_mm=[1.0], every=every).light_db.get("1", math.nan)
+        return (*self._doubts, *_ghosts(light_db, self._asked))
+
+    @cached_property
+    def _doubts(self) -> tuple[str, ...]:
         asked = self._asked
         if len(asked.pictures) != 2:
             return ()
@@ -130,11 +146,12 @@ class Result:
         Raises:
             ValueError: An option is out of range. The message names the option.
         """
-        self._warn()
-        return _measured(self._pair, how)
+        measured = _measured(self._pair, how)
+        self._warn(measured)
+        return measured
 
-    def _warn(self) -> None:
-        for note in self.notes:
+    def _warn(self, measured: PairQuality) -> None:
+        for note in (*self._doubts, *_ghosts(measured.light_db.get("1", math.nan), self._asked)):
             warnings.warn(note, stacklevel=3)
 
     @property
@@ -182,6 +199,15 @@ class Result:
             raise ValueError(f"out: {error}") from None
 
 
+def _ghosts(light_db: float, asked: _Pair) -> tuple[str, ...]:
+    """Return a note if the light at the eyes is so poor that ghosts are obvious, otherwise none."""
+    if not light_db < FAINT_DB:
+        return ()
+    count, views = asked.stack.count, len(asked.pictures)
+    why = f"{count} panels cannot show {views} pictures as different as these"
+    return (f"the eyes will see obvious ghosts: light is {light_db:.1f} dB at a tracking error of 1 mm, because {why}",)
+
+
 def solve(
     left: Pictures,
     right: ArrayLike | None = None,
@@ -192,6 +218,7 @@ def solve(
     cameras: Cameras | None = None,
     model: str | Path = "balanced",
     eye_sigma_mm: float = 1.0,
+    **how: Unpack[Solving],
 ) -> Result:
     """Compute the layers that show each eye its picture.
 
@@ -215,15 +242,23 @@ def solve(
             look at the stack's origin and to cover the panels before they are solved and measured.
         model: `fast`, `balanced`, `best`, `sart`, or the path to an ONNX file.
         eye_sigma_mm: Tracking error to allow for: 1 suits a good tracker, and 0 assumes exact positions.
+        **how: `steps`, the number of updates of all panels after the network's proposal or, for `sart`, its iterations.
+            By default, as many as the model was made for.
 
     Raises:
         ValueError: An argument is invalid. The message begins with the argument's name.
     """
+    if unknown := sorted(how.keys() - Solving.__annotations__.keys()):
+        raise TypeError(f"{unknown[0]}: unknown argument")
     pair = _checked(left, right, stack=stack, eyes_m=eyes_m, fov_deg=fov_deg, cameras=cameras)
+    steps = how.get("steps")
+    steps = None if steps is None else _whole("steps", steps, STEPS_MOST)
     eye_sigma_mm = _number("eye_sigma_mm", eye_sigma_mm, 0.0, 1000.0, "mm")
     with _one_at_a_time:
         try:
-            predictor = _loaded(_name_of(model), pair.stack)
+            name = _name_of(model)
+            is_sart = steps is not None and name == "sart"
+            predictor = SartPredictor(pair.stack, iterations=steps or 0) if is_sart else _loaded(name, pair.stack)
             start_ns = time.perf_counter_ns()
             codes = [as_codes(picture) for picture in pair.pictures]
             solved = solve_still(
@@ -233,6 +268,7 @@ def solve(
                 predictor=predictor,
                 eye_sigma_mm=eye_sigma_mm,
                 trimmed=True,
+                steps=steps,
             )
             total_ms = (time.perf_counter_ns() - start_ns) / 1e6
             layers = np.ascontiguousarray(solved.layers[..., :3])
@@ -522,6 +558,13 @@ def _name_of(model: Any) -> str:
 @lru_cache(maxsize=2)
 def _loaded(model: str, stack: PanelStack) -> Predictor:
     return load_predictor(model, stack)
+
+
+def _whole(name: str, value: Any, most: int) -> int:
+    """Return a whole number from 0 to `most`. Raises ValueError if it is none."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 0 <= value <= most:
+        raise ValueError(f"{name}: must be a whole number from 0 to {most}, not {value!r}")
+    return int(value)
 
 
 def _eyes(eyes_m: Any, stack: PanelStack, *, count: int) -> F64:

@@ -35,7 +35,7 @@ def as_picture(name: str, given: Any) -> Picture:
     picture: Any = _from_pillow(name, given) if hasattr(given, "getbands") else as_array(name, given)
     if picture.ndim != 3 or picture.shape[2] not in (3, 4) or min(picture.shape[:2]) < LEAST_PX:
         told = f"shape must be (h, w, 3) or (h, w, 4), with h and w at least {LEAST_PX}, but is {picture.shape}"
-        raise ValueError(f"{name}: {told}{_advice_on_shape(name, picture)}")
+        raise ValueError(f"{name}: {told}{_advice_on_shape(name, picture, is_tensor=hasattr(given, 'detach'))}")
     if picture.dtype != np.uint8:
         if not np.issubdtype(picture.dtype, np.floating):
             told = f"must be uint8 (0 to 255) or floating point (0 to 1), not {picture.dtype}"
@@ -116,12 +116,15 @@ def _from_pillow(name: str, image: Any) -> U8:
         raise ValueError(f"{name}: cannot be decoded: {error}") from None
 
 
-def _advice_on_shape(name: str, picture: Any) -> str:
+def _advice_on_shape(name: str, picture: Any, *, is_tensor: bool) -> str:
     if picture.ndim == 2 or (picture.ndim == 3 and picture.shape[2] == 1):
         return f"; for a grey picture, pass np.dstack([{name}] * 3)"
-    if picture.ndim == 3 and picture.shape[0] in (3, 4):
-        return f"; channels must come last, so pass np.moveaxis({name}, 0, -1)"
-    return f"; pass one picture, such as {name}[0]" if picture.ndim == 4 and picture.shape[0] == 1 else ""
+    is_batch = picture.ndim == 4 and picture.shape[0] == 1
+    one = f"{name}[0]" if is_batch else name
+    if picture.ndim == 3 + is_batch and picture.shape[is_batch] in (3, 4) and picture.shape[-1] not in (3, 4):
+        last = f"{one}.permute(1, 2, 0)" if is_tensor else f"np.moveaxis({one}, 0, -1)"
+        return f"; channels must come last, so pass {last}"
+    return f"; pass one picture, such as {one}" if is_batch else ""
 
 
 def _advice_on_type(name: str, picture: Any) -> str:

@@ -526,3 +526,56 @@ def test_without_stderr_pairs_are_solved_and_a_file_as_folder_is_named(
     with pytest.raises(ValueError, match=r"^out: .*a"):
         result.save(tmp_path / "a")
     assert (tmp_path / "a").read_text() == "x"
+
+
+@pytest.mark.parametrize("model", ["fast", "sart"])
+def test_more_steps_serve_the_eyes_better(model: str) -> None:
+    pair = phasestack.example_pair()
+
+    def light_db(steps: int | None) -> float:
+        how: Any = {} if steps is None else {"steps": steps}
+        result = phasestack.solve(
+            pair.left, pair.right, eyes_m=pair.eyes_m, stack=pair.stack, fov_deg=pair.fov_deg, model=model, **how
+        )
+        return result.measure(sigmas_mm=(1,), every=8).light_db["1"]
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # one step leaves ghosts
+        assert light_db(1) + 0.5 < light_db(6)
+    assert light_db(None) > 25
+
+
+@pytest.mark.parametrize("steps", [-1, 1.5, True, "2", 1001])
+def test_steps_that_are_none_are_refused(steps: Any) -> None:
+    pair = phasestack.example_pair()
+    with pytest.raises(ValueError, match="steps: must be a whole number from 0 to 1000"):
+        phasestack.solve(pair.left, pair.right, eyes_m=pair.eyes_m, stack=pair.stack, steps=steps)
+
+
+def test_obvious_ghosts_are_noted() -> None:
+    rng, (height, width) = np.random.default_rng(1), (180, 320)
+    noise = [rng.integers(0, 256, (height, width, 3)).astype(np.uint8) for _ in range(2)]
+    stack = phasestack.Stack(0.5184, 0.2916, (-0.06, 0.0, 0.06), width_px=width, height_px=height)
+    result = phasestack.solve(*noise, eyes_m=((0.6, -0.03, 0), (0.6, 0.03, 0)), stack=stack, model="fast")
+    with pytest.warns(UserWarning, match="obvious ghosts"):
+        quality = result.quality
+    assert quality.light_db["1"] < 21 and any("obvious ghosts: light is" in note for note in result.notes)
+
+
+def test_a_tensor_with_channels_first_gets_the_torch_way_out() -> None:
+    torch = pytest.importorskip("torch")
+    eyes, stack = ((0.6, -0.03, 0), (0.6, 0.03, 0)), phasestack.example_pair().stack
+    for shape, way in (
+        ((3, 90, 160), r"left\.permute\(1, 2, 0\)"),
+        ((1, 3, 90, 160), r"left\[0\]\.permute\(1, 2, 0\)"),
+    ):
+        with pytest.raises(ValueError, match=way):
+            phasestack.solve(torch.zeros(shape), torch.zeros(shape), eyes_m=eyes, stack=stack)
+
+
+def test_millimetres_are_not_also_too_few_panels() -> None:
+    with pytest.raises(ValueError, match=r"for -60 millimetres, write -0\.06") as told:
+        phasestack.Stack(0.518, 0.291, (-60, 0, 60), width_px=640, height_px=360)
+    assert "at least 2 items" not in str(told.value)
+    with pytest.raises(ValueError, match="at least 2 items"):
+        phasestack.Stack(0.518, 0.291, (0.0,), width_px=640, height_px=360)

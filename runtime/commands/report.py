@@ -11,6 +11,13 @@ import typer
 def report(
     out: Annotated[Path, typer.Option(help="folder for index.html, report.json and the plots")] = Path("report"),
     pairs: Annotated[Path | None, typer.Option(help="folder containing case files for your own stereo pairs")] = None,
+    only_pairs: Annotated[
+        bool, typer.Option("--only-pairs", help="measure only the case files, and no built-in scenes or motions")
+    ] = False,
+    layers: Annotated[
+        list[Path] | None,
+        typer.Option(help="folder with another solver's layers and times for the case files (can be repeated)"),
+    ] = None,
     focal: Annotated[bool, typer.Option("--focal", help="also measure focal parallax through the layers")] = False,
     model: Annotated[list[str] | None, typer.Option(help="additional ONNX file to compare (can be repeated)")] = None,
     quick: Annotated[
@@ -24,21 +31,29 @@ def report(
     Pressing Ctrl-C stops the run but keeps the page written so far. To include the published network, convert its
     checkpoint with `phasestack export` and pass the converted file with --model.
 
-    Example: phasestack report --pairs my-pairs --out report
+    --layers takes a folder with CASE/layer-0.png (rear) and so on for every case file, and times.json with a time in ms
+    for every case, such as {"case-1": 12.5}.
+
+    Example: phasestack report --pairs my-pairs --only-pairs --layers my-solver --out report
     """
-    from runtime.report.assemble import whole_report
+    from runtime.errors import InputError
+    from runtime.report.assemble import Own, whole_report
     from runtime.support.artifacts import refuse_file, to_json
     from runtime.support.progress import status_line
 
     refuse_file(out)
+    if only_pairs and pairs is None:
+        raise InputError("report", "--only-pairs", "requires --pairs")
     parts = ["phasestack report", *([f"--pairs {pairs.name}"] if pairs else []), *(["--focal"] if focal else [])]
     parts += [f"--model {Path(name).name}" for name in model or []]
-    parts += ["--quick"] if quick else []
+    parts += [f"--layers {folder.name}" for folder in layers or []]
+    parts += [*(["--only-pairs"] if only_pairs else []), *(["--quick"] if quick else [])]
     try:
         with status_line("report") as tell:
             record = whole_report(
                 out,
                 pairs=pairs,
+                own=Own(only_pairs, tuple(layers or ())),
                 with_focal=focal,
                 models=model or [],
                 quick=quick,
@@ -51,11 +66,11 @@ def report(
     if as_json:
         print(to_json(record))
         return
-    for result in sorted(record["methods"], key=lambda r: r["ms_p50"]):
-        size = f"{result['width_px']}x{result['height_px']}"
+    for result in sorted(record["methods"], key=lambda r: (r["x_m"], r["width_px"], r["ms_p50"])):
+        size = f"{len(result['x_m'])} panels {result['width_px']}x{result['height_px']}"
         light = result["light_db"].get("1", float("nan"))
         print(
-            f"{result['name']:18}{size:>11}{result['ms_p50']:10.1f} ms   "
+            f"{result['name']:18}{size:>20}{result['ms_p50']:10.1f} ms   "
             f"light {light:6.2f} dB, one ray {result['psnr_db']:6.2f} dB {result['memory_mib']:7.0f} MiB"
         )
     print(f"see {out / 'index.html'} (the figure to quote is the light PSNR, which assumes a tracking error of 1 mm)")

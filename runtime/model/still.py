@@ -28,6 +28,7 @@ def solve_still(
     predictor: Predictor,
     eye_sigma_mm: float = TRACKING_SIGMA_MM,
     trimmed: bool = False,
+    steps: int | None = None,
 ) -> Prediction:
     """Compute the layers for pictures taken by cameras aimed at the stack's origin.
 
@@ -39,11 +40,12 @@ def solve_still(
         fov_deg: The pictures' horizontal field of view.
         eye_sigma_mm: Standard deviation of the tracking error.
         trimmed: True to skip work that the pictures do not need (`trim`), if the model supports it.
+        steps: Number of steps. None: all of the model's.
     """
     watch = Stopwatch(*STAGES)
     codes = [np.ascontiguousarray(picture[..., :3]) for picture in pictures]
     views = captured_views(codes, eyes_m, predictor.stack, fov_deg=fov_deg)
-    job = Job(Targets(predictor.stack, eyes_m, views), eye_sigma_m=eye_sigma_mm / 1e3)
+    job = Job(Targets(predictor.stack, eyes_m, views), eye_sigma_m=eye_sigma_mm / 1e3, steps=steps)
     if trimmed and predictor.trims:
         job = trim(job)
     watch.lap("prepare")

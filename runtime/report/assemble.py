@@ -2,26 +2,40 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from runtime.config import ModelSettings, StackGeometry
-from runtime.model.predictor import load_predictor
+from runtime.config import StackGeometry
+from runtime.errors import InputError, MissingPart
+from runtime.model.predictor import SHIPPED
+from runtime.optics.stack import PanelStack
 from runtime.records import Effort
 from runtime.report import focal, moving
 from runtime.report.benchmark import too_busy, yardstick_ms
-from runtime.report.frontier import Method, MethodResult, apart, measure, shipped_and_references
+from runtime.report.frontier import Method, MethodResult, apart, given_layers, measure, shipped_and_references
 from runtime.report.page import Page, PageSection, describe
 from runtime.report.pairs import StillPair, procedural_pairs, read_pairs
 from runtime.report.sections import focal_section, frontier_section, moving_section
 
 QUOTE = "light_db at a tracking error of 1 mm, the mean over both eyes' pupils and pixels; for motion, live_db"
 Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Own:
+    """What a report does with the user's case files in addition to measuring all methods on them."""
+
+    only: bool = False  # True to measure only the case files, and no built-in scenes or motions
+    layers: tuple[Path, ...] = ()  # folders with other solvers' layers for the case files (docs/contracts.md)
+
+
+OWN = Own()
 
 
 class GrowingPage:
@@ -72,6 +86,7 @@ def whole_report(
     out: Path,
     *,
     pairs: Path | None = None,
+    own: Own = OWN,
     with_focal: bool = False,
     models: Sequence[str] = (),
     quick: bool = False,
@@ -85,6 +100,7 @@ def whole_report(
     Args:
         out: Folder for the page, the plots and report.json.
         pairs: Folder with case files. They are measured before the built-in scenes.
+        own: What else is done with the case files.
         with_focal: Also measure focal parallax.
         models: Names or ONNX files of models to measure in addition to the shipped ones.
         quick: Draw built-in scenes with a quarter of the pixels, omit the slowest reference, and use shorter motions.
@@ -99,29 +115,51 @@ def whole_report(
     stack = StackGeometry().stack()
     if quick:
         stack = replace(stack, width_px=960, height_px=540)
-    for name in models:
-        # Reject an invalid model now rather than after minutes of measuring.
-        for each in dict.fromkeys([*(pair.stack for pair in cases), stack]):
-            load_predictor(name, each, ModelSettings(threads=1)).close()
-    page = GrowingPage(out, command, progress)
     methods = shipped_and_references(models, quick=quick)
-    for size, own in _by_size(cases).items():
-        title = f"{len(own)} case file{'s' if len(own) > 1 else ''}, {size}"
-        _frontier(page, methods, own, title=title, name=f"cases-{size}", key="methods")
-    key = "methods_on_built_in_scenes" if cases else "methods"
-    _frontier(page, methods, procedural_pairs(stack), title="built-in scenes", name="scenes", key=key)
-    _moving(page, quick=quick)
+    _refuse_unsuitable(methods, cases, () if own.only else (stack,))
+    others = [given_layers(folder, cases) for folder in own.layers]
+    page = GrowingPage(out, command, progress)
+    for number, (each, group) in enumerate(_by_stack(cases).items()):
+        title = f"{len(group)} case file{'s' if len(group) > 1 else ''}, {_described(each)}"
+        _frontier(page, [*others, *methods], group, title=title, name=f"cases-{number + 1}", key="methods")
+    if not own.only:
+        key = "methods_on_built_in_scenes" if cases else "methods"
+        _frontier(page, methods, procedural_pairs(stack), title="built-in scenes", name="scenes", key=key)
+        _moving(page, quick=quick)
     if with_focal:
         _focal(page)
     page.finished()
     return page.record
 
 
-def _by_size(cases: Sequence[StillPair]) -> dict[str, list[StillPair]]:
-    groups: dict[str, list[StillPair]] = {}
+def _refuse_unsuitable(methods: Sequence[Method], cases: Sequence[StillPair], stacks: Sequence[PanelStack]) -> None:
+    """Load every method for every stack now, so that none is refused after minutes of measuring.
+
+    Raises InputError if a method cannot serve a stack. The message names the first case file with that stack.
+    """
+    for stack in dict.fromkeys([*(pair.stack for pair in cases), *stacks]):
+        for method in methods:
+            try:
+                method.opened(stack, threads=1).close()
+            except (InputError, MissingPart) as error:
+                named = next((pair.name for pair in cases if pair.stack == stack), None)
+                if named is None or method.source not in SHIPPED:
+                    raise
+                raise InputError(f"{named}.json", "panels", str(error)) from None
+
+
+def _by_stack(cases: Sequence[StillPair]) -> dict[PanelStack, list[StillPair]]:
+    groups: dict[PanelStack, list[StillPair]] = {}
     for pair in cases:
-        groups.setdefault(f"{pair.stack.width_px}x{pair.stack.height_px}", []).append(pair)
+        groups.setdefault(pair.stack, []).append(pair)
     return groups
+
+
+def _described(stack: PanelStack) -> str:
+    """Return a stack's number of panels, gaps and raster, such as `3 panels 60 mm apart, 1920x1080`."""
+    gaps = {f"{1000 * (b - a):.3g}" for a, b in itertools.pairwise(stack.x_m)}
+    apart_mm = f"{gaps.pop()} mm apart" if len(gaps) == 1 else f"{1000 * (stack.x_m[-1] - stack.x_m[0]):.3g} mm deep"
+    return f"{stack.count} panels {apart_mm}, {stack.width_px}x{stack.height_px}"
 
 
 def _frontier(

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal, ParamSpec, TypeVar
 
 import numpy as np
 
-from runtime.errors import FatalError, PhasestackError
+from runtime.errors import FatalError, InputError, PhasestackError
 from runtime.evaluation.solved import PairQuality, SolvedPair
 from runtime.evaluation.trials import timed
 from runtime.optics.carried import intensities
@@ -25,6 +25,8 @@ from runtime.optics.quality import psnr_db
 from runtime.records import U8
 from runtime.report.pairs import StillPair
 from runtime.support.artifacts import write_text
+from runtime.support.picture_file import read_image
+from runtime.support.sections import read_table
 
 if TYPE_CHECKING:
     from runtime.model.predictor import Predictor
@@ -32,7 +34,7 @@ if TYPE_CHECKING:
 
 P = ParamSpec("P")
 T = TypeVar("T")
-Kind = Literal["network", "iterative"]
+Kind = Literal["network", "iterative", "layers"]
 SHIPPED = ("balanced", "fast", "best")  # the default model comes first in a report
 SART = (1, 3, 10, 30)  # iteration counts of the reference methods
 ENOUGH_S = 2.0  # total time after which no further runs of a method on a pair are timed
@@ -45,11 +47,11 @@ QUOTED = "1"  # the `light_db` key of the figure to quote, at a tracking error o
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """A method of computing layers, compared in the report: a network, or SART as an iterative reference."""
+    """A method of computing layers: a network, SART as an iterative reference, or another solver's stored layers."""
 
     name: str
     kind: Kind
-    source: str  # model name, or path of an ONNX file, as for `load_predictor`
+    source: str  # model name, or path of an ONNX file, as for `load_predictor`; for layers, their folder
     iterations: int = 0  # number of SART iterations; 0 for a network
 
     def opened(self, stack: PanelStack, *, threads: int) -> Predictor:
@@ -66,6 +68,38 @@ class Method:
         if self.iterations:
             return SartPredictor(stack, iterations=self.iterations)
         return load_predictor(self.source, stack, ModelSettings(threads=threads))
+
+
+TIMES = "times.json"  # file with another solver's times in ms, by case
+
+
+def given_layers(folder: Path, cases: Sequence[StillPair]) -> Method:
+    """Return a method for a folder with another solver's layers: `CASE/layer-K.png` and `times.json`.
+
+    Raises InputError if a file is missing or unusable, or if there are no cases.
+    """
+    if not cases:
+        raise InputError(folder, "", "--layers requires --pairs with the case files that the layers were solved for")
+    method = Method(folder.name, "layers", str(folder))
+    for pair in cases:
+        stored_run(method, pair)
+    return method
+
+
+def stored_run(method: Method, pair: StillPair) -> MethodRun:
+    """Read another solver's layers and time for a pair. Raises InputError if they are missing or unusable."""
+    folder = Path(method.source)
+    times = read_table(folder / TIMES)
+    time_ms = times.get(pair.name)
+    if isinstance(time_ms, bool) or not isinstance(time_ms, int | float) or not 0 < time_ms < math.inf:
+        raise InputError(folder / TIMES, pair.name, "must be the time in ms for this case, a number above 0")
+    layers = [read_image(folder / pair.name / f"layer-{n}.png") for n in range(pair.stack.count)]
+    size = (pair.stack.height_px, pair.stack.width_px)
+    for n, layer in enumerate(layers):
+        if layer.shape[:2] != size:
+            shape = f"{layer.shape[1]}x{layer.shape[0]} pixels, but the case's panels have {size[1]}x{size[0]}"
+            raise InputError(folder / pair.name / f"layer-{n}.png", "", f"has {shape}")
+    return MethodRun(np.stack([layer[..., :3] for layer in layers]), (float(time_ms),), 0.0, 0, "")
 
 
 def shipped_and_references(models: Sequence[str] = (), *, quick: bool = False) -> list[Method]:
@@ -112,6 +146,7 @@ class MethodResult:
     precision: str
     width_px: int
     height_px: int
+    x_m: tuple[float, ...]  # the panels' positions, rear to front
     ms_p50: float
     ms_p99: float
     memory_mib: float
@@ -160,7 +195,8 @@ def measure(
     results: dict[str, list[PairResult]] = {method.name: [] for method in methods}
     for pair in pairs:
         for method in methods:
-            run = apart(run_method, method, replace(pair, off=()), threads)
+            is_stored = method.kind == "layers"
+            run = stored_run(method, pair) if is_stored else apart(run_method, method, replace(pair, off=()), threads)
             viewer = viewers if method is methods[0] else None
             results[method.name].append(pair_result(pair, run, viewer=viewer))
             yield f"{method.name}, {pair.name}", _together(method, pair, run, results[method.name])
@@ -251,6 +287,7 @@ def _together(method: Method, pair: StillPair, run: MethodRun, pairs: list[PairR
         precision=run.precision,
         width_px=pair.stack.width_px,
         height_px=pair.stack.height_px,
+        x_m=pair.stack.x_m,
         ms_p50=float(np.median(all_ms)),
         ms_p99=float(np.percentile(all_ms, 99)),
         memory_mib=max(one.memory_mib for one in pairs),

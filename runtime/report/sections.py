@@ -84,7 +84,7 @@ def rising(places: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
 
 def kind_of(result: MethodResult) -> str:
     """Return the key in KINDS that determines a result's curve and style."""
-    return "shipped" if result.name in SHIPPED else "added" if result.kind == "network" else result.kind
+    return "shipped" if result.name in SHIPPED else "added" if result.kind in ("network", "layers") else result.kind
 
 
 def method_table(results: Sequence[MethodResult]) -> Table:

@@ -17,6 +17,8 @@ from runtime.errors import one_line, without_secrets
 from runtime.support.folders import state_folder
 
 STEM = "phasestack-error-"
+ROOMS = "runtime", "phasestack", "calib", "model_export"
+REPORT = "please report this bug with the file "
 KEPT = 20  # maximum number of reports; a service that fails repeatedly must not fill the disk
 
 
@@ -26,7 +28,26 @@ def written(error: BaseException) -> str:
     If no file can be written, the line says so. Never raises an exception.
     """
     summary = one_line(f"{type(error).__name__}: {error}" if str(error) else type(error).__name__)
+    if place := _user_code(error):
+        report = report_of("", "".join(traceback.format_exception(error))).removeprefix(REPORT)
+        return f"{summary} in {place}; the trace is in {report}"
     return f"unexpected error: {summary}; {report_of('', ''.join(traceback.format_exception(error)))}"
+
+
+def _user_code(error: BaseException) -> str:
+    """Return the file and line of a user's class that raised an error, or an empty string if phasestack did.
+
+    Frames of installed packages and of Python are skipped.
+    """
+    root = Path(__file__).resolve().parents[2]
+    own, installed = [root / name for name in ROOMS], [Path(sys.prefix), Path(sys.base_prefix)]
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        path = Path(frame.filename)
+        if any(path.is_relative_to(folder) for folder in own):
+            return ""
+        if path.is_file() and not any(path.is_relative_to(folder) for folder in installed):
+            return f"{path}:{frame.lineno}"
+    return ""
 
 
 def report_of(summary: str, trace: str) -> str:
@@ -60,7 +81,7 @@ def report_of(summary: str, trace: str) -> str:
             with contextlib.suppress(OSError):  # some files may belong to another user
                 for old in sorted(folder.glob(f"{STEM}*.log"))[:-KEPT]:
                     old.unlink()
-            return f"please report this bug with the file {path}"
+            return f"{REPORT}{path}"
     return "the crash report could not be written"
 
 

@@ -104,7 +104,11 @@ def validated(model: type[M], table: dict[str, Any], *, source: str | Path, fold
         return model.model_validate(table, context=folder)
     except ValidationError as error:
         problems: dict[str, str] = {}
-        for field, problem in (_wrong_field(model, each) for each in error.errors()):
+        errors = error.errors()
+        inner = {each["loc"][:-1] for each in errors}
+        # Pydantic counts only the valid items, so a list with an invalid item is also reported as too short.
+        errors = [each for each in errors if each["type"] != "too_short" or each["loc"] not in inner]
+        for field, problem in (_wrong_field(model, each) for each in errors):
             before = problems.get(field)  # a field of several types has an error for each of them
             problems[field] = problem if before is None else f"{before} or {problem.removeprefix(EXPECTED)}"
         (name, problem), *others = problems.items()

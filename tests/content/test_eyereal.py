@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +22,7 @@ from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.support.artifacts import write_png
 from tests.content.conftest import image_view, panel_view
+from tests.page.rig import ROOT
 
 LEGO = "lego_bulldozer"
 LEFT, RIGHT = (6.486, -0.263, 2.004), (6.487, 0.237, 2.004)
@@ -141,3 +146,16 @@ def test_a_folder_is_read_as_the_preset_in_its_name(tmp_path: Path, context: Any
         InputError, match=r"from-the-net: name: does not contain the name of a preset; set content.scene"
     ):
         open_content(ContentSettings(scene=str(other)), stack, context)
+
+
+def test_a_folder_of_unseen_views_is_evaluated_with_any_model(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    for number in range(2):
+        write_pair(tmp_path, context, stack, number, dy=0.1 * number)
+    command = [sys.executable, str(ROOT / "examples" / "unseen_views.py"), str(tmp_path), "--preset", LEGO]
+    done = subprocess.run(
+        [*command, "--model", "fast", "--model", "sart"],
+        env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True, timeout=200, check=True,
+    )  # fmt: skip
+    told = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [(one["model"], one["pairs"]) for one in told] == [("fast", 2), ("sart", 2)]
+    assert all(one["psnr_db"] > 28 and 0.8 < one["ssim"] <= 1 and one["light_db"] > 20 for one in told)

@@ -45,7 +45,7 @@ def test_the_example_is_shown_from_a_folder_of_its_own(tmp_path: Path) -> None:
         ("", 'scene = "tunnel:Tunnel"\noptions = { radius_m = 9 }', "content.options: radius_m: "),
         ("", 'scene = "gone:Tunnel"', "content.scene: `gone` cannot be imported: "),
         ("", 'scene = "json:JSONDecoder"', "`json:JSONDecoder` is not a class derived from phasestack.ContentSource"),
-        ("return 1 / 0", 'scene = "own:Own"', "own:Own: unexpected error: ZeroDivisionError: division by zero"),
+        ("return 1 / 0", 'scene = "own:Own"', "own:Own: ZeroDivisionError: division by zero in {folder}/own.py:"),
         (
             "return self",
             'scene = "own:Own"',
@@ -66,4 +66,4 @@ def test_a_wrong_one_is_one_line(
         monkeypatch.delitem(sys.modules, name, raising=False)
     with pytest.raises(InputError) as refused:
         open_content(load_settings(tmp_path / "own.toml").content, stack, context)
-    assert told in str(refused.value) and "\n" not in str(refused.value)
+    assert told.replace("{folder}", str(tmp_path)) in str(refused.value) and "\n" not in str(refused.value)

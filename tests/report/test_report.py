@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import typer
 from typer.testing import CliRunner
@@ -18,11 +19,12 @@ from runtime.errors import InputError
 from runtime.evaluation.solved import PairQuality
 from runtime.model.predictor import model_path
 from runtime.report import sections
-from runtime.report.assemble import GrowingPage, whole_report
+from runtime.report.assemble import GrowingPage, Own, whole_report
 from runtime.report.frontier import MethodResult, PairResult
 from runtime.report.moving import FULL, Moving, moving_run
 from runtime.report.page import Page, PageSection, Table, describe
 from runtime.report.sections import frontier_section, moving_section, rising
+from runtime.support.artifacts import write_png
 from tests.report.test_pairs import case_folder
 
 
@@ -75,6 +77,61 @@ def test_a_report_that_is_stopped_is_a_page_with_what_was_measured(tmp_path: Pat
     assert "This report is not finished" in page and page.count("data:image/png;base64,") == 1
 
 
+def own_cases(folder: Path) -> Path:
+    """Two cases with three panels and one with two, and `theirs`: layers for all of them."""
+    for name, x_m in (("a", [-0.05, 0.0, 0.05]), ("b", [-0.05, 0.0, 0.05]), ("c", [0.0, 0.05])):
+        case_folder(folder, panels={"width_m": 0.5, "height_m": 0.3, "x_m": x_m}, off=None)
+        (folder / "case.json").rename(folder / f"{name}.json")
+        for n in range(len(x_m)):
+            write_png(folder / "theirs" / name / f"layer-{n}.png", np.full((18, 32, 3), 85, np.uint8))
+    (folder / "theirs" / "times.json").write_text('{"a": 11, "b": 12.5, "c": 13}')
+    return folder
+
+
+def test_cases_are_grouped_by_stack_and_another_solver_s_layers_join_them(tmp_path: Path) -> None:
+    cases, started = own_cases(tmp_path / "cases"), set()
+
+    def stop_before_the_models(what: str) -> None:
+        started.add(what)
+        if "balanced" in what and "2 panels" in what:
+            raise KeyboardInterrupt
+
+    own = Own(only=True, layers=(cases / "theirs",))
+    with pytest.raises(KeyboardInterrupt):
+        whole_report(tmp_path / "out", pairs=cases, own=own, quick=True, progress=stop_before_the_models)
+    record = json.loads((tmp_path / "out" / "report.json").read_text())
+    theirs = [one for one in record["methods"] if one["name"] == "theirs"]
+    assert [len(one["x_m"]) for one in theirs] == [3, 2] and [one["ms_p50"] for one in theirs] == [11.75, 13]
+    assert [[pair["pair"] for pair in one["pairs"]] for one in theirs] == [["a", "b"], ["c"]]
+    titles = {what.partition(": ")[2].partition(":")[0] for what in started}
+    assert titles == {"2 case files, 3 panels 50 mm apart, 32x18", "1 case file, 2 panels 50 mm apart, 32x18"}
+
+
+def test_every_case_and_layer_is_checked_before_anything_is_measured(tmp_path: Path) -> None:
+    cases = own_cases(tmp_path / "cases")
+    arguments = ("--pairs", str(cases), "--only-pairs", "--layers", str(cases / "theirs"))
+    for spoilt, told in (
+        ((cases / "theirs" / "times.json", '{"a": 11, "b": 12.5}'), "times.json: c: must be the time in ms"),
+        ((cases / "theirs" / "c" / "layer-1.png", None), "layer-1.png: cannot be read"),
+    ):
+        path, text = spoilt
+        before = path.read_bytes()
+        path.write_text(text) if text else path.unlink()
+        done = command("--out", str(tmp_path / "out"), *arguments)
+        assert isinstance(done.exception, InputError) and told in str(done.exception)
+        path.write_bytes(before)
+    assert "requires --pairs" in str(command("--only-pairs", "--out", str(tmp_path / "out")).exception)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_only_pairs_leaves_out_everything_built_in(tmp_path: Path) -> None:
+    cases = own_cases(tmp_path / "cases")
+    record = whole_report(tmp_path / "out", pairs=cases, own=Own(only=True), quick=True)
+    assert record["complete"] and "moving" not in record and "methods_on_built_in_scenes" not in record
+    assert {len(one["x_m"]) for one in record["methods"]} == {2, 3}
+
+
 @pytest.mark.slow
 def test_the_whole_report_is_made_in_one_run(tmp_path: Path) -> None:
     theirs = tmp_path / "theirs.onnx"
@@ -100,7 +157,7 @@ def test_the_whole_report_is_made_in_one_run(tmp_path: Path) -> None:
 def method(name: str, kind: str, ms: float, light: float) -> MethodResult:
     off = {"2mm": light - 6, "4mm": light - 9, "6mm": light - 11}
     dB = {"0": light + 2, "1": light, "2": light - 3}
-    told = (960, 540, ms, ms * 1.3, 200.0, 81, dB, dB, light + 3, 0.97, light + 1, off)
+    told = (960, 540, (-0.06, 0.0, 0.06), ms, ms * 1.3, 200.0, 81, dB, dB, light + 3, 0.97, light + 1, off)
     quality = PairQuality(dB, dB, light, 0.97, (light, light))
     pair = PairResult("a pair", (ms,), 200.0, quality, off)
     return MethodResult(name, kind, "fp32", *told, pairs=[pair])  # type: ignore[arg-type]
