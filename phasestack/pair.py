@@ -110,10 +110,10 @@ class Result:
     def quality(self) -> PairQuality:
         """Quality of what the eyes see, compared with the pictures they should see.
 
-        The quality is measured on first access, which may take longer than solving. A warning is issued for each entry
-        in `notes`.
+        The quality is measured on first access, which may take longer than solving. A warning is issued for each known
+        reason of ghosts.
         """
-        self._warn(self._pair.quality)
+        self._warn()
         return self._pair.quality
 
     @cached_property
@@ -122,9 +122,11 @@ class Result:
 
         A reason is that the pictures have too much disparity for the stack, which is checked for two pictures.
         """
+        if self._doubts:
+            return self._doubts
         every = max(1, min(NOTED_EVERY, min(self._asked.pictures[0].shape[:2]) // EVERY_LEAST))
         light_db = self._pair.sampled(sigmas_mm=[1.0], every=every).light_db.get("1", math.nan)
-        return (*self._doubts, *_ghosts(light_db, self._asked))
+        return _ghosts(light_db, self._asked)
 
     @cached_property
     def _doubts(self) -> tuple[str, ...]:
@@ -146,12 +148,11 @@ class Result:
         Raises:
             ValueError: An option is out of range. The message names the option.
         """
-        measured = _measured(self._pair, how)
-        self._warn(measured)
-        return measured
+        self._warn()
+        return _measured(self._pair, how)
 
-    def _warn(self, measured: PairQuality) -> None:
-        for note in (*self._doubts, *_ghosts(measured.light_db.get("1", math.nan), self._asked)):
+    def _warn(self) -> None:
+        for note in self._doubts:
             warnings.warn(note, stacklevel=3)
 
     @property
