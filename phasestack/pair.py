@@ -45,7 +45,7 @@ from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG, SEPARATION_MIN_M, 
 EVERY_LEAST = 20  # minimum number of pixels to sample along a picture's shorter side
 STEPS_MOST = 1000  # maximum number of steps of a solution
 FAINT_DB = 21.0  # light PSNR below which the eyes see obvious ghosts (as on the viewer page)
-NOTED_EVERY = 8  # every so many pixels and rows are measured for `Result.notes`
+NOTED_EVERY = 8  # `Result.notes` is based on every 8th pixel of every 8th row
 LEAST_APART_M = 0.0005  # minimum distance between two views' eyes if there are more than two
 REAL_PIXELS = 20_000  # pixels of a picture that are measured on real panels, about
 SAME_PLACE_M = 0.001  # maximum distance between an eye and its camera
@@ -562,7 +562,7 @@ def _loaded(model: str, stack: PanelStack) -> Predictor:
 
 
 def _whole(name: str, value: Any, most: int) -> int:
-    """Return a whole number from 0 to `most`. Raises ValueError if it is none."""
+    """Return a whole number from 0 to `most`. Raises ValueError for any other value."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 0 <= value <= most:
         raise ValueError(f"{name}: must be a whole number from 0 to {most}, not {value!r}")
     return int(value)

@@ -29,7 +29,7 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class Own:
-    """What a report does with the user's case files in addition to measuring all methods on them."""
+    """Options for the case files."""
 
     only: bool = False  # True to measure only the case files, and no built-in scenes or motions
     layers: tuple[Path, ...] = ()  # folders with other solvers' layers for the case files (docs/contracts.md)
