@@ -23,7 +23,7 @@ from runtime.support.artifacts import png_bytes, to_json
 from runtime.support.threads import parallel_map
 
 WEBP_MAX_PX = 16383
-EXTRA_BYTES = 60 << 10  # how much larger a page may be than its layers as PNG files
+EXTRA_BYTES = 64 << 10  # how much larger a page may be than its layers as PNG files
 PAGE_BYTES = 8_000_000  # maximum size of a page
 LAYERS_BYTES = 6_400_000  # maximum size of lossless layers in a page; larger ones (4K) are compressed lossily
 QUALITY_BYTES = 512  # space reserved for the lines that state how good the compressed pictures are

@@ -293,14 +293,14 @@ def test_the_page_is_small_beside_its_pictures_and_asks_for_nothing(tmp_path: Pa
 
 
 @pytest.mark.parametrize("width_px", [320, 960])
-def test_a_page_is_no_larger_than_its_layers_files_and_60_kib(tmp_path: Path, width_px: int) -> None:
+def test_a_page_is_no_larger_than_its_layers_files_and_64_kib(tmp_path: Path, width_px: int) -> None:
     stack = replace(STACK, width_px=width_px, height_px=width_px * 9 // 16)
     eyes, pictures = pair(stack)
     result = phasestack.solve(*pictures, eyes_m=eyes, stack=stack, model="fast")
     result.save(tmp_path)
     files = sum((tmp_path / f"layer-{n}.png").stat().st_size for n in range(3))
     page = (tmp_path / "viewer.html").read_text()
-    assert len(page.encode()) <= files + 60 * 1024
+    assert len(page.encode()) <= files + 64 * 1024
     urls = json.loads(re.findall(r'id="layers">(.*?)</script>', page)[0])
     for url, layer in zip(urls, result.layers, strict=True):
         decoded = cv2.imdecode(np.frombuffer(base64.b64decode(url.partition(",")[2]), np.uint8), cv2.IMREAD_COLOR_RGB)
@@ -358,3 +358,27 @@ def test_a_run_that_saw_nobody_can_be_looked_into_too(tmp_path: Path) -> None:
     assert phasestack_command("run", *options).returncode == 0
     page = (out / "viewer.html").read_text()
     assert "no viewer was seen" in page and page.count("data:image/webp;base64,") == 3 and '"follows": false' in page
+
+
+@pytest.mark.slow
+def test_panels_as_built_show_what_the_simulator_computes(tmp_path: Path) -> None:
+    pair = phasestack.example_pair()
+    at: Any = {"stack": pair.stack, "eyes_m": pair.eyes_m, "fov_deg": pair.fov_deg}
+    layers = phasestack.solve(pair.left, pair.right, **at).layers
+    targets = [pair.left, pair.right]
+    page = viewer_html(layers, targets, pair.stack, eyes_m=pair.eyes_m, fov_deg=pair.fov_deg, text=["as built"])
+    (tmp_path / "viewer.html").write_text(page)
+    built = [{"shift_px": 3}, {"black": 0.02}, {}, {"short_deg": 5}]
+    told = driven("built.mjs", tmp_path / "viewer.html", 640, 360, json.dumps(built), tmp_path)
+    assert told["errors"] == []
+    assert told["sliders"] == [0, 5, 0, 0, 0]
+    panels = Panels(pair.stack.width_m, pair.stack.height_m, pair.stack.x_m)
+    rows, columns = np.arange(20, 340, 16), np.arange(20, 620, 16)
+    shifted, grey, ideal = (cv2.imread(str(tmp_path / f"built-{k}.png"))[..., ::-1] / 255 for k in range(3))
+    front_moved = np.concatenate([layers[:-1], np.roll(layers[-1:], 3, axis=2)])
+    truth, _ = light(front_moved, panels, pair.eyes_m[0], rows=rows, columns=columns)
+    assert -10 * np.log10(((shifted[np.ix_(rows, columns)] - truth) ** 2).mean()) > 38
+    assert np.abs(grey - (ideal + 0.02 * (1 - ideal))).mean() < 0.01
+    real = phasestack.RealPanels(cells=(phasestack.Cell(white_deg=85.0),))
+    simulated_db = phasestack.evaluate(layers, *targets, **at, panels=real, sigmas_mm=(0,)).light_db["0"]
+    assert float(re.findall(r"(\d+\.\d) dB", told["told"])[0]) == pytest.approx(simulated_db, abs=0.5)

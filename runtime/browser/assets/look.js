@@ -1,6 +1,6 @@
 // User interface for a page that shows a display: the head is moved with the pointer or keys, and there are viewing
 // modes and figures.
-import { Display, alignment, unaligned, panelDraws, drawPlan, middle, moved, reach } from "/display.js";
+import { Display, IDEAL, alignment, unaligned, panelDraws, drawPlan, middle, moved, reach } from "/display.js";
 
 const MODES = [ // key, name, group, hint
   ["wiggle", "Wiggle", "Eyes", "Alternates between the two eyes' pictures. The nearest parts jump the most."],
@@ -23,12 +23,21 @@ const SOFTWARE = { rays: 1, coarse: 0.5, frame_ms: 60 };
 const STEP_M = 0.005, REACH_M = [0.5, 0.3];
 // SAMPLED: light is measured at every SAMPLED-th pixel in both directions.
 const REST_MS = 200, REST_RAYS = 5, STRIPS = 12, WIGGLE_MS = 280, REPORT_MS = 120, SAMPLED = 12;
+// Sliders for panels "as built": key in `built`, label, greatest value, step, factor from the slider's value to the key's.
+const BUILT = [
+  ["shift_px", "front panel off to the right, pixels", 3, 0.25, 1],
+  ["short_deg", "full white short of 90°, degrees", 20, 1, 1],
+  ["gamma", "grey curves off by a gamma, %", 30, 1, 0.01],
+  ["black", "black as a share of white, %", 2, 0.1, 0.01],
+  ["lines", "black lines between subpixels, % of the area", 60, 5, 0.01],
+];
 const PAGE = `
 <div class="stage"><canvas tabindex="0" aria-label="What the eyes see. Arrow keys move the head; + and - move it nearer and farther."></canvas>
 <svg class="over" aria-hidden="true"></svg><div class="names" aria-hidden="true"></div><p class="notice" role="status" hidden></p></div>
 <aside><h1></h1><p class="how">Move your head with the pointer, a finger or the arrow keys. Scroll to move it nearer or farther.</p><div class="first"></div><div class="modes"></div><p class="hint"></p>
 <div class="switches"><label><input type="checkbox" data-key="aligned" checked> outer panels follow the head</label>
 <label><input type="checkbox" data-key="pupil"> pupils 4 mm wide</label><button type="button" class="quiet">Reset head</button></div>
+<details class="built"><summary>As built</summary><p class="how">What imperfect panels would show. See phasestack tolerance for what each costs.</p></details>
 <p class="head" role="status"></p><p class="light"></p><div class="point"></div>
 <div class="views"><figure><svg data-axis="1" viewBox="0 0 320 170" role="img" aria-label="Eyes and panels from above"></svg><figcaption>from above</figcaption></figure>
 <figure><svg data-axis="2" viewBox="0 0 320 170" role="img" aria-label="Eyes and panels from the side"></svg><figcaption>from the side</figcaption></figure></div>
@@ -120,7 +129,7 @@ export class Look {
     const resting = !this.fresh && performance.now() - this.moving > REST_MS, { width, height, resized } = this.#fitted(resting);
     this.fresh = false;
     const draws = this.#draws(this.mode === "difference" ? unaligned(this.stack) : undefined);
-    this.quick = !resting && this.rays === 1 && this.flatness === 0 && !this.pupil && !["panels", "apart", "target", "difference"].includes(this.mode) ? draws : null;
+    this.quick = !resting && this.rays === 1 && this.flatness === 0 && !this.pupil && !this.display.isBuilt && !["panels", "apart", "target", "difference"].includes(this.mode) ? draws : null;
     if (!this.quick) this.display.show(draws);
     const turning = this.mode === "wiggle";
     if (!resting || turning || ["panels", "apart", "target"].includes(this.mode)) {
@@ -393,6 +402,17 @@ export class Look {
         this.draw();
       });
     this.$(".switches button").addEventListener("click", () => this.moveTo([0, 0, 0]));
+    this.$(".built").append(...BUILT.map(([key, name, max, step, factor]) => {
+      const label = node("label", name), input = Object.assign(node("input"), { type: "range", min: 0, max, step, value: 0 }), output = node("output", "0");
+      input.dataset.key = key;
+      input.addEventListener("input", () => {
+        output.textContent = input.value;
+        this.display.built = { ...this.display.built, [key]: input.value * factor };
+        this.draw();
+      });
+      label.append(input, output);
+      return label;
+    }));
   }
 
   #nearer(metres) {
@@ -414,6 +434,15 @@ export class Look {
       setHead: (head) => this.moveTo([...head]),
       align: (on) => {
         this.$("[data-key=aligned]").checked = this.aligned = Boolean(on);
+        this.draw();
+      },
+      build: (built) => {
+        this.display.built = { ...IDEAL, ...built };
+        for (const [key, , , , factor] of BUILT) {
+          const input = this.$(`.built [data-key=${key}]`);
+          input.value = this.display.built[key] / factor;
+          input.nextElementSibling.textContent = input.value;
+        }
         this.draw();
       },
       picture: (eye, width, height, pupil_mm = 0) => {
