@@ -1,0 +1,149 @@
+"""Show live pictures, such as those of a video player, with a view for each eye.
+
+A feed's thread keeps the newest picture. The solver never waits for it.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from runtime.config import ContentSettings
+from runtime.content.base import ContentInfo, ContentSource, View
+from runtime.content.images import WarpedPicture, plane_from_pixels, rgba_from_rgb
+from runtime.content.layout import MONO, Layout, hint, layout_of, of_film
+from runtime.content.pictures import screen
+from runtime.content.placing import SceneFile
+from runtime.errors import ContentFailure
+from runtime.records import U8
+from runtime.support.background import begin
+
+FROZEN_S = 2.0  # a feed counts as frozen after this time without a picture
+CLOSES_WITHIN_S = 2.0
+LOOKED_AT_EVERY = 30  # pictures after which a flat feed is checked again for two views
+
+
+@dataclass(frozen=True, slots=True)
+class LivePicture:
+    """A picture of a feed."""
+
+    number: int  # increases with each picture
+    rgb: U8  # (h, w, 3), with every view in the layout
+    taken_s: float  # on the monotonic clock
+    pixel_aspect: float = 1.0  # pixel width divided by pixel height
+
+
+class Feed(ABC):
+    """Thread that reads pictures from outside and keeps the newest one."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.newest: LivePicture | None = None
+        self.problem = f"waiting for {name}"  # one line; empty while pictures arrive
+        self._ends = threading.Event()
+        self._count = 0
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        """Start reading."""
+        self._thread = begin(f"feed {self.name}", self._run)
+
+    def close(self) -> None:
+        """Stop reading, and wait a short time for the thread to end."""
+        self._ends.set()
+        if self._thread is not None:
+            self._thread.join(CLOSES_WITHIN_S)
+
+    @abstractmethod
+    def _run(self) -> None:
+        """Read pictures and call `_take` for each, until `_ends` is set."""
+
+    def _take(self, rgb: U8, pixel_aspect: float = 1.0) -> None:
+        self._count += 1
+        self.newest = LivePicture(self._count, rgb, time.monotonic(), pixel_aspect)
+        self.problem = ""
+
+    def state(self) -> str:
+        """Return why no new pictures arrive, in one line, or an empty string."""
+        newest = self.newest
+        if self.problem or newest is None:
+            return self.problem
+        still_s = time.monotonic() - newest.taken_s
+        return f"{self.name}: no new picture for {still_s:.0f} s" if still_s > FROZEN_S else ""
+
+
+class LiveSource(ContentSource):
+    """Source that shows a feed's newest picture on the plane through the display's centre."""
+
+    def __init__(self, feed: Feed, *, file: SceneFile, context: object = None) -> None:
+        """Start the feed, which the source owns from now on."""
+        self._feed, self._file = feed, file
+        self.info = ContentInfo(feed.name, moving=True, background=file.background)
+        self._at = 0
+        self._views: list[U8] = []
+        self._shown: dict[int, WarpedPicture] = {}
+        self._layout: tuple[tuple[int, ...], int, Layout] = ((), 0, MONO)  # a picture's shape, number and layout
+        feed.start()
+
+    @property
+    def problem(self) -> str:
+        return self._feed.state()
+
+    def revision(self, *, time_ns: int) -> int:
+        newest = self._feed.newest
+        return 0 if newest is None else newest.number
+
+    def render(self, view: View, *, time_ns: int) -> U8:
+        self.expect([view], time_ns=time_ns)
+        which = min(view.side, len(self._views) - 1)
+        if which not in self._shown:
+            self._shown[which] = WarpedPicture(rgba_from_rgb(self._views[which]), background=self._file.background)
+        return self._shown[which].warped(plane_from_pixels(view.pixels_from_stack, self._screen), view)
+
+    def expect(self, views: Any, *, time_ns: int) -> None:
+        """Take the newest picture, unless the next view is the same pair's second one."""
+        newest = self._feed.newest
+        if newest is None:
+            raise ContentFailure(self._feed.problem or f"waiting for {self._feed.name}")
+        is_second = len(views) == 1 and views[0].side == 1 and self._at
+        if newest.number == self._at or is_second:
+            return
+        layout = self._layout_for(newest)
+        try:
+            parts = layout.views(newest.rgb)
+        except ValueError as error:
+            raise ContentFailure(f"{self._feed.name}: {error}") from None
+        height, width = parts[0].shape[:2]
+        aspect = layout.pixel_aspect(width_px=width, height_px=height)
+        self._screen = screen(self._file.stack, width_px=width, height_px=height, pixel_aspect=aspect)
+        self._views, self._at, self._shown = parts, newest.number, {}
+
+    def _layout_for(self, picture: LivePicture) -> Layout:
+        """Return the layout that the settings state, or the one that a picture of a new size seems to have."""
+        shape, number, layout = self._layout
+        is_unsure = layout.kind == "mono" and picture.number >= number + LOOKED_AT_EVERY
+        if shape != picture.rgb.shape or (is_unsure and self._file.settings.layout == "auto"):
+            layout = layout_for(picture, self._file.settings)
+            self._layout = picture.rgb.shape, picture.number, layout
+        return layout
+
+    def close(self) -> None:
+        self._feed.close()
+
+
+def layout_for(picture: LivePicture, settings: ContentSettings) -> Layout:
+    """Return a live picture's layout: the one in the settings or, with `auto`, side by side if the halves are alike."""
+    layout = settings.layout
+    if layout == "auto":
+        layout = hint(picture.rgb) or "mono"
+    path = Path(settings.scene)
+    stated = layout_of(path, settings.model_copy(update={"layout": layout}))
+    stated = replace(stated, sample_aspect=picture.pixel_aspect)
+    if settings.layout == "auto":
+        height, width = picture.rgb.shape[:2]
+        stated = of_film(stated, path, width_px=round(width * picture.pixel_aspect), height_px=height)
+    return stated
