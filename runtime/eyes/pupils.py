@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from typing import Literal
@@ -10,6 +11,7 @@ import cv2
 import numpy as np
 
 from runtime.eyes.face_flow import BRIDGE, FaceFlow
+from runtime.eyes.liveness import NEAR, OPEN_MIN, Liveness, Sign
 from runtime.eyes.networks import FaceNetwork, FoundFace, IrisNetwork, MeshNetwork, Square, transformed
 from runtime.records import F64, U8
 
@@ -34,7 +36,6 @@ IRIS_RATIO_MAX = 1.4  # maximum ratio between the two irises' diameters
 # distance, this centre is too low by the following share of the eye separation (0.6 mm). The share was fitted to all 51
 # measured faces. If it is fitted to a random half of them, the error on the other half is 0.61 to 0.67 mm up to 1 m.
 TOO_LOW = 0.0093
-OPEN_MIN = 0.12  # minimum ratio of height to width for an open eye; a blink hides the iris
 
 PULL = 0.1  # share of the deviation from the networks' estimate corrected with each picture
 # When the gaze changes, the gain rises by up to GAZE_PULL as the deviation increases from GAZE_FROM to GAZE_FULL
@@ -86,6 +87,11 @@ class _Look:
     def eye_distance(self) -> float:
         return float(np.linalg.norm(self.eyes[0] - self.eyes[1]))
 
+    @property
+    def sign(self) -> Sign:
+        """The face's sign of life."""
+        return Sign(self.eyes.mean(axis=0), self.eye_distance, bool(self.openness.max() < OPEN_MIN), self.looks)
+
     def are_human(self) -> bool:
         """Return True if the irises are as large, and as similar to each other, as human irises."""
         sizes = self.iris / self.eye_distance
@@ -110,11 +116,17 @@ class PupilFinder:
         """
         self._faces, self._meshes, self._irises = FaceNetwork(), MeshNetwork(), IrisNetwork()
         self._flow, self._lock_ns = FaceFlow(), lock_ns
-        self.viewer = 0
+        self.viewer = self._found_count = 0
         self.forget()
 
     def forget(self) -> None:
-        """Forget the viewer. The next picture is treated as the first one."""
+        """Forget the viewer, and the pictures of faces. The next picture is treated as the first one."""
+        self._liveness = Liveness()
+        self._leave()
+
+    def _leave(self) -> None:
+        """Forget the viewer."""
+        self._liveness.begin()
         self._looks: F64 | None = None  # appearance of the viewer's face, kept while it is out of sight
         self._last: _Look | None = None  # the viewer's estimates from the previous picture
         self._eyes = np.zeros((2, 2))  # pupils returned for the previous picture, px
@@ -130,7 +142,7 @@ class PupilFinder:
             time_ns: The picture's capture time.
         """
         if self._looks is not None and time_ns - self._seen_ns > self._lock_ns:
-            self.forget()
+            self._leave()
             self.choice = "the viewer has left"
         look, seen = self._follow(picture), "followed"
         if look is None:
@@ -139,6 +151,12 @@ class PupilFinder:
         if look is None:
             self._last = None
             return None
+        if self._liveness.is_due(look.sign, time_ns) and (person := self._person(picture, look)) is not None:
+            self._liveness.mark_viewer()
+            self._leave()
+            self.choice = "the face seen before neither moves nor blinks, so somebody who does is followed"
+            self.viewer += 1
+            look, seen = person, "found"
         self.reason, self._seen_ns = "", time_ns
         return self._steadied(picture, look, "followed" if seen == "followed" else "found")
 
@@ -155,25 +173,37 @@ class PupilFinder:
         look = self._measured(picture, mesh, presence)
         return look if look.looks @ self._looks > SAME_LOOKS_FOLLOWED else None
 
-    def _search(self, picture: U8) -> _Look | None:
-        """Search the whole picture for the viewer, or choose a new viewer if none is remembered."""
+    def _person(self, picture: U8, viewer: _Look) -> _Look | None:
+        """Return somebody other than the viewer who has moved or blinked since the previous call."""
+        looks = [look for look in self._found(picture) if look.sign.apart(viewer.sign) > NEAR and look.are_human()]
+        index = self._liveness.person_among([look.sign for look in looks])
+        return None if index is None else looks[index]
+
+    def _found(self, picture: U8) -> Iterator[_Look]:
+        """Yield the faces in a picture, the most likely viewer first."""
         faces: list[FoundFace] = []
         for longest_px in LEVELS_PX:
             faces = faces or self._faces.find(picture, longest_px=longest_px, score_min=SCORE_MIN)
-        self.reason = "no face"
+        self._found_count = len(faces)
         middle = np.array(picture.shape[1::-1]) / 2
         faces.sort(key=lambda face: -_worth(face, middle))
         for face in faces[:CANDIDATES_MAX]:
             mesh, presence = self._meshes.points(picture, face.square())
             if presence > PRESENCE_FOUND:
                 mesh, presence = self._meshes.points(picture, _square_of(mesh))
-            if presence < PRESENCE_FOUND:
-                continue
-            look = self._measured(picture, mesh, presence)
+            if presence >= PRESENCE_FOUND:
+                yield self._measured(picture, mesh, presence)
+
+    def _search(self, picture: U8) -> _Look | None:
+        """Search the whole picture for the viewer, or choose a new viewer if none is remembered."""
+        self.reason = "no face"
+        for look in self._found(picture):
             if not look.are_human():
                 self.reason = "a face without a person's eyes"
+            elif self._looks is None and self._liveness.is_picture(look.sign, alike=SAME_LOOKS):
+                self.reason = "a face that neither moves nor blinks"
             elif self._looks is None:
-                self.choice = f"following the foremost of {len(faces)} face(s)"
+                self.choice = f"following the foremost of {self._found_count} face(s)"
                 self.viewer += 1
                 return look
             elif look.looks @ self._looks > SAME_LOOKS:

@@ -131,3 +131,43 @@ def test_a_hidden_eye_is_carried_along_and_labelled() -> None:
 def test_a_picture_of_any_size_and_shape_is_looked_at() -> None:
     for shape in ((1, 1), (3, 2000), (2000, 3), (40, 40)):
         assert find_eyes(np.zeros((*shape, 3), np.uint8)) is None
+
+
+def two(number: int, *, wall_moves: bool, person_moves: bool) -> np.ndarray:
+    """Pictures of a small face on the wall, and from the fifth second on a larger one in front of it."""
+    sway = 0.012 * np.sin(number / 2)
+    wall = np.array([-0.45 + sway * wall_moves, 0.0, 1.4])
+    person = np.array([0.12 + sway * person_moves, 0.0, 0.6])
+    places, portraits = ((wall, person), (grace(), eileen())) if number >= 25 else ((wall,), (grace(),))
+    return scene(*places, intrinsics=CAMERA, portraits=portraits, noise=2, seed=number)[0]
+
+
+def whose(**moves: bool) -> list[str]:
+    finder, seen = PupilFinder(lock_ns=10**9), []
+    for number in range(75):
+        found = finder.find(two(number, **moves), time_ns=number * 200_000_000)
+        assert found is not None
+        seen.append("wall" if found.eyes_px[0, 0] < 320 else "person")
+    return seen
+
+
+def test_a_face_on_the_wall_gives_way_to_a_person_who_moves() -> None:
+    seen = whose(wall_moves=False, person_moves=True)
+    assert seen[0] == "wall" and seen[30] == "wall"
+    assert set(seen[-25:]) == {"person"}
+
+
+def test_a_person_who_moves_is_kept_and_so_is_one_who_sits_still_alone_or_among_pictures() -> None:
+    assert set(whose(wall_moves=True, person_moves=True)) == {"wall"}
+    assert set(whose(wall_moves=False, person_moves=False)) == {"wall"}
+
+
+def test_a_face_on_the_wall_is_not_taken_again_unless_it_moves() -> None:
+    finder = PupilFinder(lock_ns=10**9)
+    for number in range(60):
+        finder.find(two(number, wall_moves=False, person_moves=True), time_ns=number * 200_000_000)
+    for number in range(60, 75):  # the person has left
+        found = finder.find(two(0, wall_moves=False, person_moves=True), time_ns=number * 200_000_000)
+    assert found is None and finder.reason == "a face that neither moves nor blinks"
+    moved = scene(np.array([-0.40, 0.0, 1.4]), intrinsics=CAMERA, portraits=(grace(),))[0]
+    assert finder.find(moved, time_ns=76 * 200_000_000) is not None
