@@ -19,7 +19,7 @@ OPEN_MIN = 0.12  # minimum ratio of height to width for an open eye
 
 @dataclass(frozen=True, slots=True)
 class Sign:
-    """Where a face is in a picture, and whether its eyes are open."""
+    """A face's position in a picture, and whether its eyes are closed."""
 
     middle: F64  # (2,) midpoint between the pupils, px
     eye_distance: float  # px
