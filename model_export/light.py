@@ -1,7 +1,13 @@
 """Compute the light at the eyes, and the solver's steps, as differentiable torch functions.
 
-The runtime's kernels are tested against this reference implementation, and networks are trained by backpropagating
-through it. The equations are the ones in docs/mathematics.md, "A step".
+Networks are trained by backpropagating through these functions, and the runtime is tested against them. The equations
+are the ones in docs/mathematics.md, "A step". Each function is the twin of one in `runtime`:
+
+    Views.of      model/geometry.py: Geometry.panels_from_rays; optics/light.py: panels_from_centre
+    light, step   kernels/solver.cpp: a step's rays, gradient and curvature
+    traced        kernels/light.cpp: see, along random rays
+    light_db      optics/light.py: squared_errors, for pinhole eyes
+    improved      model/solver.py: the steps after the network
 
 *Light.* Panel n shows x_n in [0, 1]. Along a ray, s is the sum of x_n, and the intensity is I = sin²(pi/2·s) =
 (1 - Re exp(i·pi·s))/2. A pixel of an eye's picture is a bundle of rays. Within a bundle, the values on different panels

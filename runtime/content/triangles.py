@@ -22,7 +22,7 @@ from runtime.content.shapes import solid_winding
 from runtime.optics.rect import PixelRect
 from runtime.records import F32, F64, U8
 from runtime.support.background import raise_if_abandoned
-from runtime.support.gl import DrawnPicture
+from runtime.support.gl import DrawnPicture, set_uniforms
 
 PROJECTED_MAX = 5000  # if a part has more vertices, its box is projected instead to find its extent
 DRAWN_AT_ONCE = 20_000  # triangles per draw call
@@ -239,7 +239,7 @@ class _Look:
         for name, matrix in (("stack_from_part", self._normals), ("clip_from_part", self._clip)):
             if (uniform := program.get(name, None)) is not None:
                 uniform.write(matrix)
-        _set_uniforms(program, colour=part.colour, glow=part.glow, glow_picture=len(part.textures) - 1)
+        set_uniforms(program, {"colour": part.colour, "glow": part.glow, "glow_picture": len(part.textures) - 1})
         for unit, texture in enumerate(part.textures):
             texture.use(unit)
 
@@ -345,7 +345,7 @@ class TriangleSource(CanvasSource):
                     self.context.front_face = front
                 look.set(part.surface_program, part)
                 least = OPAQUE_FROM if part.is_blended else part.cutoff
-                _set_uniforms(part.surface_program, kept=(least, ANY_ALPHA))
+                set_uniforms(part.surface_program, {"kept": (least, ANY_ALPHA)})
                 part.draw_surface()
             if self._ramps is not None:
                 self._draw_outlines(self._ramps, looks, arranged.nearest_first, view)
@@ -367,7 +367,7 @@ class TriangleSource(CanvasSource):
             if part.is_blended:
                 look.set(part.surface_program, part)
                 context.front_face = look.front_face
-                _set_uniforms(part.surface_program, kept=(1 / 255, OPAQUE_FROM))
+                set_uniforms(part.surface_program, {"kept": (1 / 255, OPAQUE_FROM)})
                 for hidden in ("front", "back") if part.two_sided else ("back",):
                     context.cull_face = hidden
                     part.draw_surface()
@@ -426,17 +426,10 @@ class TriangleSource(CanvasSource):
             if count:
                 part = self.parts[n]
                 looks[n].set(part.outline.program, part)
-                _set_uniforms(part.outline.program, kept=(part.cutoff, ANY_ALPHA))
+                set_uniforms(part.outline.program, {"kept": (part.cutoff, ANY_ALPHA)})
                 part.outline.render(first=len(TRIANGLES) * begin, vertices=len(TRIANGLES) * count)
                 begin += count
         framebuffer.depth_mask = True
-
-
-def _set_uniforms(program: Any, **values: Any) -> None:
-    """Set a program's uniforms. Uniforms that the compiler has removed are ignored."""
-    for name, value in values.items():
-        if (uniform := program.get(name, None)) is not None:  # the operator `in` would try all names in turn
-            uniform.value = value
 
 
 def _uploaded(context: Any, array: Any) -> Any:

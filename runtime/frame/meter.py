@@ -6,17 +6,21 @@ All measurements run on the solver's thread.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from runtime.clock import NS_PER_S
-from runtime.model.geometry import panel_from_middle
+from runtime.model.geometry import TargetView
 from runtime.model.job import Job
 from runtime.model.solver import REDUCTIONS
+from runtime.optics.light import panels_from_centre
 from runtime.optics.presentation import displacement
 from runtime.optics.relief import parallax
+from runtime.optics.retina import through_layers
+from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8, Effort, Measures
 from runtime.support.gl import DrawnPicture
 
@@ -101,25 +105,26 @@ def sampled_light(layers: U8, job: Job, places: F64, *, boxes: bool) -> float | 
         boxes: True to treat each panel pixel as a uniform square. False for a coarse solution, which is enlarged
             bilinearly.
     """
-    stack, middle = job.stack, job.stack.count // 2
-    rasters = [stack.panel(n) for n in range(stack.count)]
-    products = []
-    for eye_m, view in zip(job.eyes_m, job.views, strict=True):
-        height, width = view.picture.shape[:2]
-        middle_from_picture = rasters[middle].raster_from_plane() @ view.plane_from_picture
-        column, row = (places[0] * (width, height)).astype(int).T
-        target = view.pixels[row, column, :3] / np.float32(255)
-        offset = (places % (1 / 64) * 64).reshape(-1, 2).T  # position within the pixel, whichever was chosen
-        at = middle_from_picture @ np.stack([*(np.tile((column, row), 2) + offset), np.ones(2 * len(row))])
-        total, counts = np.zeros((2 * len(row), 3), np.float32), np.ones(2 * len(row), bool)
-        for n in range(stack.count):
-            x, y, w = at / at[2] if n == middle else panel_from_middle(stack, rasters, eye_m, n) @ (at / at[2])
-            values, inside = _sampled(layers[n], x / w, y / w, boxes=boxes)
-            total, counts = total + values, counts & inside
-        first, second = np.split(np.sin(np.float32(np.pi / 2 / 255) * total) ** 2 - np.tile(target, (2, 1)), 2)
-        products.append((first * second)[np.logical_and(*np.split(counts, 2))])
-    product = np.concatenate(products)
+    eyes = zip(job.eyes_m, job.views, strict=True)
+    product = np.concatenate([_products(layers, job.stack, eye_m, view, places, boxes=boxes) for eye_m, view in eyes])
     return max(float(product.mean()), 0.0) if product.size else None
+
+
+def _products(
+    layers: U8, stack: PanelStack, eye_m: F64, view: TargetView, places: F64, *, boxes: bool
+) -> NDArray[np.floating[Any]]:
+    """Return the (K', 3) products of errors at those pixels in an eye's picture whose two rays cross all panels."""
+    height, width = view.picture.shape[:2]
+    column, row = (places[0] * (width, height)).astype(int).T
+    target = view.pixels[row, column, :3] / np.float32(255)
+    offset = (places % (1 / 64) * 64).reshape(-1, 2).T  # position within the pixel, whichever was chosen
+    rays = np.stack([*(np.tile((column, row), 2) + offset), np.ones(2 * len(row))])
+    middle_from_picture = stack.panel(stack.count // 2).raster_from_plane() @ view.plane_from_picture
+    crossed = panels_from_centre(eye_m, stack) @ (middle_from_picture @ rays)  # (N, 3, 2K)
+    positions = [(x / w, y / w) for x, y, w in crossed[:, :, None]]
+    seen = through_layers(layers, lambda _: positions, np.ones((1, 2 * len(row)), bool), stack, boxes=boxes)
+    first, second = np.split(seen.image[0] - np.tile(target, (2, 1)), 2)
+    return np.asarray((first * second)[np.logical_and(*np.split(seen.mask[0], 2))])
 
 
 def lost_detail(picture: U8) -> Mapping[int, float]:
@@ -179,29 +184,3 @@ def _moved_grid(pictures: Sequence[U8], job: Job, eyes_m: F64) -> list[F32]:
     u, v = (columns + right / 2).astype(np.float32), (rows[:, None] + down / 2).astype(np.float32)
     warped = [cv2.remap(picture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for picture in pictures]
     return [np.asarray(picture[..., :3] / np.float32(255), np.float32) for picture in warped]
-
-
-def _sampled(layer: U8, x: F64, y: F64, *, boxes: bool) -> tuple[F32, NDArray[np.bool_]]:
-    """Sample a layer at K positions given in fractional pixels.
-
-    Args:
-        layer: Layer of shape (h, w, 4).
-        x: Columns, shape (K,).
-        y: Rows, shape (K,).
-        boxes: True to treat each pixel as a uniform square. False to interpolate bilinearly, clamped at the edge.
-
-    Returns:
-        Colours (K, 3) in 0..255, and a mask (K,) that is True for each position inside the layer.
-    """
-    height, width = layer.shape[:2]
-    inside = (x >= 0) & (x <= width) & (y >= 0) & (y <= height)
-    if boxes:
-        u, v = np.clip(x, 0, width - 1).astype(int), np.clip(y, 0, height - 1).astype(int)
-        return np.asarray(layer[v, u, :3], np.float32), inside
-    x, y = np.clip(x - 0.5, 0, width - 1), np.clip(y - 0.5, 0, height - 1)
-    u, v = x.astype(int), y.astype(int)
-    right, down = (x - u)[:, None].astype(np.float32), (y - v)[:, None].astype(np.float32)
-    u1, v1 = np.minimum(u + 1, width - 1), np.minimum(v + 1, height - 1)
-    above = layer[v, u, :3] * (1 - right) + layer[v, u1, :3] * right
-    below = layer[v1, u, :3] * (1 - right) + layer[v1, u1, :3] * right
-    return np.asarray(above * (1 - down) + below * down, np.float32), inside

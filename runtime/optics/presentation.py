@@ -27,10 +27,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.optics.malus import rest_code
+from runtime.optics.sampling import Pixels, bilinear
 from runtime.records import F32, F64, U8, PanelFrame, Parallax
 
 ROWS = 32  # rows resampled at a time; a strip's float32 pixels fit in a core's cache
-Pixels = NDArray[np.floating[Any]]
 
 
 class PixelMap(NamedTuple):
@@ -174,7 +174,7 @@ def displacement(
 
 
 def _pushed(relief: F32, relief_from_shown: PixelMap, push: PixelMap, u: Pixels, v: Pixels) -> tuple[Pixels, Pixels]:
-    b = _bilinear(relief, *relief_from_shown.at(u, v))
+    b = bilinear(relief, *relief_from_shown.at(u, v))
     right, down = push.at(u, v)
     return b * right, b * down
 
@@ -230,7 +230,7 @@ def shown_picture(draw: PanelDraw, solved: U8 | None, flat: U8 | None) -> U8:
             codes = _read(texels, *draw.solved_at(u, v), draw)
         if draw.shows_flat:
             assert flat is not None
-            mixed = _bilinear(flat, u, v)
+            mixed = bilinear(flat, u, v)
             codes = np.asarray(codes + (mixed - codes) * np.float32(draw.flatness), np.float32)
         if inside is not None:
             codes = np.where(inside[..., None], codes, np.float32(0))
@@ -305,25 +305,6 @@ def _cubic(t: F32) -> tuple[F32, F32, F32, F32]:
         return ((np.float32(-0.75) * d + np.float32(3.75)) * d - np.float32(6)) * d + np.float32(3)
 
     return far(1 + t), near(t), near(1 - t), far(2 - t)
-
-
-def _bilinear(grid: U8 | F32, u: Pixels, v: Pixels) -> F32:
-    """Return an (h, w[, C]) grid's values at positions in its pixels, bilinear and clamped to its edge."""
-    height, width = grid.shape[:2]
-    x, y = np.clip(u - 0.5, 0.0, width - 1.0), np.clip(v - 0.5, 0.0, height - 1.0)
-    low_x, low_y = np.floor(x), np.floor(y)
-    right, down = (x - low_x).astype(np.float32), (y - low_y).astype(np.float32)
-    if grid.ndim == 3:
-        right, down = right[..., None], down[..., None]
-    columns, rows = low_x.astype(np.intp), low_y.astype(np.intp)
-    if not right.any() and not down.any():
-        return np.asarray(grid[rows, columns], np.float32)
-    next_columns, next_rows = np.minimum(columns + 1, width - 1), np.minimum(rows + 1, height - 1)
-    above, below = (
-        _between(np.array(grid[at, columns], np.float32), np.array(grid[at, next_columns], np.float32), right)
-        for at in (rows, next_rows)
-    )
-    return _between(above, below, down)
 
 
 def _between(low: F32, high: F32, weight: F32) -> F32:

@@ -1,17 +1,21 @@
-"""Simulate the images seen through the layers by an eye with a pinhole or a finite pupil."""
+"""Simulate the images seen through the layers by an eye with a pinhole or a finite pupil.
+
+`through_layers` adds up panel values along any rays: those of an eye's picture here, and the solution meter's random
+rays (`frame/meter.py`). `optics/light.py` measures light by the same rules with many more rays, in compiled code;
+`tests/frame/test_meter.py` compares the two.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from runtime.optics.malus import intensity_from_phase
 from runtime.optics.rpu import panel_from_image
+from runtime.optics.sampling import bilinear, nearest
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.tilt import layer_from_seen, layer_pixels_from_seen
 from runtime.optics.views import image_from_stack
@@ -37,45 +41,6 @@ class Retina:
 def strips(rows: int) -> Iterator[slice]:
     """Return slices of an image's rows, each small enough to stay in the cache between operations."""
     return (slice(start, min(start + STRIP_ROWS, rows)) for start in range(0, rows, STRIP_ROWS))
-
-
-def _planes(layer: NDArray[np.uint8] | F32) -> list[F32]:
-    return [np.ascontiguousarray(layer[..., channel], np.float32) for channel in range(layer.shape[2])]
-
-
-class _Samples:
-    """Bilinear sampler for (h, w) positions. Computes weights and indices once for all channels."""
-
-    def __init__(self, u: F32, v: F32, shape: tuple[int, ...]) -> None:
-        height, width = shape[:2]
-        # The position is NaN for a ray that never meets the panel. fmax and fmin ignore NaN.
-        x = np.fmin(np.fmax(u - np.float32(0.5), np.float32(0)), np.float32(width - 1))
-        y = np.fmin(np.fmax(v - np.float32(0.5), np.float32(0)), np.float32(height - 1))
-        self._corner = np.empty((*x.shape, 2), np.int16)
-        self._corner[..., 0] = np.fmin(x, np.float32(max(width - 2, 0)))
-        self._corner[..., 1] = np.fmin(y, np.float32(max(height - 2, 0)))
-        self._x, self._y = x - self._corner[..., 0], y - self._corner[..., 1]
-        self._right, self._below = slice(min(1, width - 1), None), slice(min(1, height - 1), None)
-
-    def of(self, plane: F32) -> F32:
-        """Return (h, w) samples from one (H, W) channel of a layer."""
-        right, below = self._right, self._below
-        no_second_map: Any = None  # OpenCV accepts None, but its type stubs do not
-        top, top_right, bottom, bottom_right = (
-            np.asarray(cv2.remap(part, self._corner, no_second_map, cv2.INTER_NEAREST), np.float32)
-            for part in (plane, plane[:, right], plane[below], plane[below, right])
-        )
-        _mix(top, top_right, self._x)
-        _mix(bottom, bottom_right, self._x)
-        _mix(top, bottom, self._y)
-        return top
-
-
-def _mix(a: F32, b: F32, weight: F32) -> None:
-    """Overwrite `a` with a + (b - a)·weight. Also overwrites `b`, with an intermediate result."""
-    b -= a
-    b *= weight
-    a += b
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +143,12 @@ def checked_eye(eye_m: ArrayLike, stack: PanelStack) -> F64:
 
 
 def through_layers(
-    layers: U8 | F32, positions: Callable[[slice], Iterable[tuple[F64, F64]]], mask: Mask, stack: PanelStack
+    layers: U8 | F32,
+    positions: Callable[[slice], Iterable[tuple[F64, F64]]],
+    mask: Mask,
+    stack: PanelStack,
+    *,
+    boxes: bool = False,
 ) -> Retina:
     """Compute an image by adding up panel values along rays, given their positions on each panel.
 
@@ -188,19 +158,17 @@ def through_layers(
             w) in panel pixels.
         mask: (h, w) mask of the rays that may count. The result's mask also excludes rays that miss a panel or cross it
             less than half a pixel inside its edge.
+        boxes: True to treat each panel pixel as a uniform square. False to interpolate bilinearly.
     """
     image, counted = np.empty((*mask.shape, 3), np.float32), mask.copy()
-    planes = [_planes(layer[..., :3]) for layer in layers]
-    unit = np.float32(1 / 255 if layers.dtype == np.uint8 else 1)
+    unit, sampled = np.float32(1 / 255 if layers.dtype == np.uint8 else 1), nearest if boxes else bilinear
     for rows in strips(mask.shape[0]):
-        total = np.zeros((3, rows.stop - rows.start, mask.shape[1]), np.float32)
-        for layer, (u, v) in zip(planes, positions(rows), strict=True):
+        total = np.zeros((rows.stop - rows.start, mask.shape[1], layers.shape[-1]), np.float32)
+        for layer, (u, v) in zip(layers, positions(rows), strict=True):
             x, y = u.astype(np.float32), v.astype(np.float32)
-            samples = _Samples(x, y, layer[0].shape)
-            for channel in range(3):
-                total[channel] += samples.of(layer[channel])
+            total += sampled(layer, x, y)
             counted[rows] &= (x > 0.5) & (x < stack.width_px - 0.5) & (y > 0.5) & (y < stack.height_px - 0.5)
-        image[rows] = np.moveaxis(intensity_from_phase(total * unit), 0, -1)
+        image[rows] = intensity_from_phase(total[..., :3] * unit)
     return Retina(image, counted)
 
 

@@ -13,6 +13,7 @@ from runtime.optics.presentation import Mount, PanelDraw, flatness_of
 from runtime.panels import lut
 from runtime.panels.geometry import layer_from_screen, permutes_pixels
 from runtime.records import F32, U8, PanelFrame
+from runtime.support.gl import set_uniforms
 
 VERTEX = """#version 330 core
 // One triangle that covers the framebuffer; pixel: the monitor's pixels, top left origin, v down.
@@ -275,7 +276,7 @@ class Painter:
             "push": tuple(draw.push),
             "flatness": draw.flatness,
         }
-        _set(program, values)
+        set_uniforms(program, values)
         textures.use(index)
         self._curve.use(2)
         array.render(moderngl.TRIANGLES, vertices=3)
@@ -294,13 +295,5 @@ def _compiled(
     """Compile the shader with all macros in `names` defined, and set the uniforms in `fixed`."""
     head = "#version 330 core\n" + "".join(f"#define {name}\n" for name in names)
     program = context.program(vertex_shader=VERTEX, fragment_shader=head + FRAGMENT)
-    _set(program, fixed)
+    set_uniforms(program, fixed)
     return program, context.vertex_array(program, [])
-
-
-def _set(program: moderngl.Program, values: Mapping[str, Any]) -> None:
-    """Set uniforms, skipping any that the compiler has removed."""
-    for name, value in values.items():
-        uniform: Any = program.get(name, None)
-        if uniform is not None:
-            uniform.value = value

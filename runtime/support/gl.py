@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import mmap
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -71,6 +72,13 @@ def finish() -> None:
     other threads would be blocked for tens of milliseconds.
     """
     _gl_finish()()
+
+
+def set_uniforms(program: Any, values: Mapping[str, Any]) -> None:
+    """Set uniforms by name, skipping any that the compiler has removed."""
+    for name, value in values.items():
+        if (uniform := program.get(name, None)) is not None:  # the operator `in` would try all names in turn
+            uniform.value = value
 
 
 @dataclass(frozen=True, slots=True)

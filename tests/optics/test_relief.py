@@ -56,7 +56,7 @@ def test_a_point_is_found_where_the_old_middle_saw_it(
     aligned = align(STACK, solved_for_m=np.stack([old_m] * 2), eyes_m=np.stack([new_m] * 2))
     for panel in range(3):
         shown = on_panel(panel, new_m, point_m)
-        right, down = displacement(moved, panel, relief, (480, 270), shown[:1], shown[1:])
+        right, down = displacement(moved, panel, relief, (480, 270), shown[None, :1], shown[None, 1:])
         matrix = aligned.solved_from_shown[panel]
         found = shown * np.diag(matrix)[:2] + matrix[:2, 2] + np.array([right.item(), down.item()])
         if not aligned.limited:

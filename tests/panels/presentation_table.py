@@ -82,7 +82,8 @@ ROWS: dict[str, Row] = {
 UNMOUNTED = [name for name, row in ROWS.items() if row.settings == PanelSettings()]  # the browser has no monitors
 
 # The stated tolerance. Drivers may filter the relief and the grey curve with weights of 1/256, and the processor
-# computes in fixed point. On the machine that recorded it, no value is off by more than one code.
+# computes in fixed point and resamples the flat picture in steps of 1/32 pixel. Without these, no value is off by more
+# than one code.
 MOST_CODES, MOST_SHARE = 3, 1e-3
 
 

@@ -59,7 +59,7 @@ export function reach(stack, eyes) {
 }
 
 // Return the homography that maps a point (y, z, 1) on the ideal panel to the point on the tilted panel's layer that an
-// eye sees in the same direction, or null if the panel is not tilted.
+// eye sees in the same direction, or null if the panel is not tilted. Twin of layer_from_seen in runtime/optics/tilt.py.
 function layerFromSeen(stack, n, eye) {
   const depth = stack.tilt?.depth[n];
   if (!depth?.some((v) => v)) return null;
@@ -82,7 +82,8 @@ function pixels(stack) {
 }
 
 // Return the homography that maps picture pixels to pixels on panel n. Each pixel's ray runs from `eye` through the
-// point on the centre panel that the `nominal` eye sees at that pixel.
+// point on the centre panel that the `nominal` eye sees at that pixel. Twin of panels_from_centre in
+// runtime/optics/light.py.
 export function panelFromPicture(stack, n, eye, picture, nominal = eye) {
   const x = centre(stack), share = (stack.x_m[n] - eye[0]) / (x - eye[0]);
   const carried = [share, 0, eye[1] * (1 - share), 0, share, eye[2] * (1 - share), 0, 0, 1];
@@ -91,8 +92,7 @@ export function panelFromPicture(stack, n, eye, picture, nominal = eye) {
   return mul(pixels(stack), seen ? mul(seen, ideal) : ideal);
 }
 
-// Return the alignment of solved layers to other eyes. For the equations, see runtime/optics/alignment.py and
-// relief.py.
+// Return the alignment of solved layers to other eyes. Twin of align in runtime/optics/alignment.py.
 // maps: for each panel, [scale u, scale v, shift u, shift v] from shown pixels to pixels of the solution.
 // parallax: how content that is not on the middle panel moves.
 // limited: why the alignment reaches its limit before the eyes, or empty if it does not.
@@ -131,7 +131,8 @@ const mapped = (stack, larger, [right, up]) => [1 + larger, 1 + larger,
   ((-stack.width_m / 2) * larger + right) * (stack.width_px / stack.width_m), -((stack.height_m / 2) * larger + up) * (stack.height_px / stack.height_m)];
 
 // Return how content moves when the eyes' midpoint moves from `old` to `now`. The result is null if the midpoint does
-// not move, or if there is no middle panel because the number of panels is even.
+// not move, or if there is no middle panel because the number of panels is even. Twin of parallax in
+// runtime/optics/relief.py.
 function parallax(stack, old, now) {
   if (stack.x_m.length % 2 === 0 || old.every((v, k) => v === now[k])) return null;
   const r = reference(stack), k = (old[0] - r) / (now[0] - r), growth = 1 - k;

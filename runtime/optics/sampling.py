@@ -1,0 +1,62 @@
+"""Values of pictures at positions in their pixels, which count from the corner and are moved into the picture."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from runtime.records import F32, U8
+
+Pixels = NDArray[np.floating[Any]]
+
+
+def bilinear(picture: U8 | F32, x: Pixels, y: Pixels) -> F32:
+    """Return an (H, W[, C]) picture's values at positions x and y, which are broadcast to (h, w).
+
+    Weights have full precision, which OpenCV's own interpolation does not offer. A position may be NaN, and then counts
+    as 0.
+    """
+    height, width = picture.shape[:2]
+    left, right = _split(x, width)
+    top, down = _split(y, height)
+    # OpenCV gathers an order of magnitude faster than NumPy.
+    corner = np.empty((*np.broadcast_shapes(left.shape, top.shape), 2), np.int16)
+    corner[..., 0], corner[..., 1] = left, top
+    if picture.ndim == 3:
+        right, down = right[..., None], down[..., None]
+    below, beside = picture[min(1, height - 1) :], slice(min(1, width - 1), None)
+    above = _mixed(_at(picture, corner), _at(picture[:, beside], corner), right)
+    return _mixed(above, _mixed(_at(below, corner), _at(below[:, beside], corner), right), down)
+
+
+def nearest(picture: U8 | F32, x: Pixels, y: Pixels) -> F32:
+    """Return the values of the pixels that positions are in. Arguments are those of `bilinear`."""
+    height, width = picture.shape[:2]
+    corner = np.empty((*np.broadcast_shapes(x.shape, y.shape), 2), np.int16)
+    corner[..., 0] = np.fmin(np.fmax(x, 0), width - 1)
+    corner[..., 1] = np.fmin(np.fmax(y, 0), height - 1)
+    return _at(picture, corner)
+
+
+def _split(place: Pixels, count: int) -> tuple[Pixels, F32]:
+    """Return the last of `count` pixel centres before each position, and the distance from there."""
+    # fmax and fmin ignore NaN.
+    inside = np.fmin(np.fmax(place - place.dtype.type(0.5), 0), count - 1)
+    low = np.fmin(np.floor(inside), max(count - 2, 0))
+    return low, (inside - low).astype(np.float32)
+
+
+def _at(picture: U8 | F32, corner: NDArray[np.int16]) -> F32:
+    no_second_map: Any = None  # OpenCV accepts None, but its type stubs do not
+    return np.asarray(cv2.remap(picture, corner, no_second_map, cv2.INTER_NEAREST), np.float32)
+
+
+def _mixed(a: F32, b: F32, weight: F32) -> F32:
+    """Return a + (b - a)·weight. Overwrites a and b."""
+    b -= a
+    b *= weight
+    a += b
+    return a
