@@ -235,10 +235,10 @@ def _has_gamma(randr: ctypes.CDLL, display: int, crtc: int) -> bool:
     size, *channels = (getattr(table.contents, name) for name in ("size", "red", "green", "blue"))
     steps = range(size if size > 1 else 0)
     straight = [step * 65535 / (size - 1) for step in steps]
-    changed = any(abs(channel[step] - straight[step]) > 257 for channel in channels for step in steps)
+    levels = [channel[step] for channel in channels for step in steps]
     randr.XRRFreeGamma(table)
     # Drivers without a table return zeros.
-    return changed and any(channel[size - 1] for channel in channels)
+    return any(levels) and any(abs(level - wanted) > 257 for level, wanted in zip(levels, 3 * straight, strict=True))
 
 
 def _refresh_hz(mode: _Mode) -> float:
