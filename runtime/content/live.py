@@ -45,7 +45,7 @@ class Feed(ABC):
         self.newest: LivePicture | None = None
         self.problem = f"waiting for {name}"  # one line; empty while pictures arrive
         self._ends = threading.Event()
-        self._count = 0
+        self._count, self._seen_s = 0, 0.0  # `_seen_s`: when the source was last seen to work
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
@@ -64,15 +64,15 @@ class Feed(ABC):
 
     def _take(self, rgb: U8, pixel_aspect: float = 1.0) -> None:
         self._count += 1
-        self.newest = LivePicture(self._count, rgb, time.monotonic(), pixel_aspect)
+        self._seen_s = time.monotonic()
+        self.newest = LivePicture(self._count, rgb, self._seen_s, pixel_aspect)
         self.problem = ""
 
     def state(self) -> str:
         """Return why no new pictures arrive, in one line, or an empty string."""
-        newest = self.newest
-        if self.problem or newest is None:
+        if self.problem:
             return self.problem
-        still_s = time.monotonic() - newest.taken_s
+        still_s = time.monotonic() - self._seen_s
         return f"{self.name}: no new picture for {still_s:.0f} s" if still_s > FROZEN_S else ""
 
 

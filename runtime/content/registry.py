@@ -106,6 +106,10 @@ def _prepared(file: SceneFile) -> Opener:
         from runtime.content import pipe
 
         return pipe.prepare(file)
+    if name == "window":
+        from runtime.content import window
+
+        return window.prepare(file)
     if name.lower().startswith("file://"):
         path = unquote(urlsplit(name).path)
         return _prepared(replace(file, path=Path(path), settings=file.settings.model_copy(update={"scene": path})))
@@ -113,7 +117,9 @@ def _prepared(file: SceneFile) -> Opener:
         problem = "is on another computer; mount the share, and set the path where it is mounted"
         raise InputError("content", "scene", f"{untrusted_input.shown(without_secrets(name))} {problem}")
     if "://" in name or name.startswith("/dev/video"):
-        problem = "live pictures require the scene `pipe`, your own class or a program; see docs/programs.md"
+        problem = (
+            "live pictures require the scene `pipe` or `window`, your own class or a program; see docs/programs.md"
+        )
         raise InputError("content", "scene", f"{untrusted_input.shown(without_secrets(name))}: {problem}")
     if is_plugin(name):
         return _plugin(name, file)

@@ -300,6 +300,8 @@ def _attach(handle: Any) -> moderngl.Context:
 
 def _hints() -> None:
     glfw.default_window_hints()
+    glfw.window_hint_string(glfw.X11_CLASS_NAME, "phasestack")  # by which the scene `window` leaves them out
+    glfw.window_hint_string(glfw.X11_INSTANCE_NAME, "phasestack")
     # Like the offscreen context, the windows use EGL, because a thread cannot switch between GLX and EGL contexts.
     glfw.window_hint(glfw.CONTEXT_CREATION_API, glfw.EGL_CONTEXT_API)
     glfw.window_hint(glfw.CONTEXT_VERSION_MAJOR, MINIMUM_VERSION // 100)

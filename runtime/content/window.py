@@ -1,0 +1,213 @@
+"""Show a window or a part of an X11 screen, which FFmpeg captures by shared memory (x11grab)."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import partial
+from typing import Annotated, Any
+
+import av
+import numpy as np
+from pydantic import Field, model_validator
+
+from runtime.config import Section, validated
+from runtime.content.base import ContentSource
+from runtime.content.live import Feed, LiveSource
+from runtime.content.placing import SceneFile
+from runtime.errors import InputError, one_line
+from runtime.records import U8
+
+LOOKS_EVERY_S = 0.5  # how often the window's place is looked up
+AGAIN_S = 0.5  # pause before the next attempt
+LOOKED_UP_WITHIN_S = 3.0  # time limit for the list of windows, and for a virtual screen's start
+OURS = "phasestack"  # class and title of our own panels
+WINDOW = re.compile(  # a line of `xwininfo -root -tree`
+    r'^\s*(?P<id>0x[0-9a-f]+) (?P<name>".*"|\(has no name\)): \((?P<kind>.*)\)\s+(?P<w>\d+)x(?P<h>\d+)\S+'
+    r"\s+(?P<x>[+-]-?\d+)(?P<y>[+-]-?\d+)\s*$"
+)
+
+
+class WindowOptions(Section):
+    """Options in [content.options] for the scene `window`: one of `title`, `region` and `command`."""
+
+    title: str = Field("", description="part of the window's title or class")
+    region: tuple[int, int, int, int] | None = Field(None, description="part of the screen: left, top, width, height")
+    command: tuple[str, ...] = Field((), description="program to start on a virtual screen, with its arguments")
+    size_px: tuple[int, int] = Field((1920, 1080), description="size of the virtual screen")
+    display: str = Field("", description="X server, by default $DISPLAY")
+    rate_hz: Annotated[float, Field(ge=1, le=120)] = Field(30.0, description="largest number of pictures per second")
+    pointer: bool = Field(True, description="show the mouse pointer")
+
+    @model_validator(mode="after")
+    def _one(self) -> WindowOptions:
+        if bool(self.title) + (self.region is not None) + bool(self.command) != 1:
+            raise ValueError("set one of title, region and command, such as { title = 'sView' }")
+        if self.region is not None and (min(self.region[:2]) < 0 or min(self.region[2:]) < 2):
+            raise ValueError("region: must be left, top, width, height, with a size of at least 2 pixels")
+        if not all(16 <= edge <= 16384 for edge in self.size_px):
+            raise ValueError("size_px: must be from 16 to 16384 pixels")
+        return self
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A part of the screen, in pixels."""
+
+    x: int
+    y: int
+    width: int
+    height: int
+    window: int = 0  # number of the window that is there, or 0 for a part of the screen
+
+
+def prepare(file: SceneFile) -> Callable[..., ContentSource]:
+    """Check the options, and return a function that creates the source.
+
+    Raises InputError if an option is invalid, or if there is no X server or a Debian package is missing.
+    """
+    options = validated(WindowOptions, file.settings.options, source="content.options")
+    needed = {"xwininfo": "x11-utils"} if options.title else {"Xvfb": "xvfb"} if options.command else {}
+    for program, package in needed.items():
+        if shutil.which(program) is None:
+            raise InputError("content", "scene", f"window requires {program}; run: sudo apt-get install {package}")
+    if not options.command and not (options.display or os.environ.get("DISPLAY")):
+        raise InputError("content.options", "display", "is not set, and neither is $DISPLAY")
+    return partial(_source, options, file)
+
+
+def _source(options: WindowOptions, file: SceneFile, context: Any = None) -> ContentSource:
+    return LiveSource(WindowFeed(options), file=file)
+
+
+def place_of(title: str, listed: str) -> Place | None:
+    """Return the place of the largest window whose title or class contains a text, or None if there is none.
+
+    Our own panels are not found.
+
+    Args:
+        title: Text to look for, in any case.
+        listed: What `xwininfo -root -tree` prints.
+    """
+    found = []
+    for line in listed.splitlines():
+        match = WINDOW.match(line)
+        if match is None:
+            continue
+        names = f"{match['name']} {match['kind']}".lower()
+        if title.lower() in names and f'"{OURS}' not in names:
+            x, y = (int(match[axis].replace("+-", "-").lstrip("+")) for axis in "xy")
+            found.append(Place(x, y, int(match["w"]), int(match["h"]), int(match["id"], 16)))
+    return max(found, key=lambda place: place.width * place.height, default=None)
+
+
+class WindowFeed(Feed):
+    """Feed that captures a window. It begins again if the window is closed, moved or resized."""
+
+    def __init__(self, options: WindowOptions) -> None:
+        name = options.command[0] if options.command else options.title or "the screen's region"
+        super().__init__(name)
+        self._options = options
+
+    def _run(self) -> None:
+        while not self._ends.is_set():
+            try:
+                with self._screen() as (display, process):
+                    while not self._ends.is_set() and (process is None or process.poll() is None):
+                        place = self._place(display)
+                        self._capture(display, place, process)
+                    if process is not None and process.poll() is not None:
+                        self.problem = f"{self.name}: ended with exit status {process.returncode}"
+            except (OSError, ValueError, subprocess.SubprocessError, av.error.FFmpegError) as error:
+                self.problem = one_line(f"{self.name}: {getattr(error, 'strerror', None) or error}")
+            self._ends.wait(AGAIN_S)
+
+    def _place(self, display: str) -> Place | None:
+        """Return the window's place, or None for the whole screen. Raises ValueError if there is no such window."""
+        options = self._options
+        if options.region is not None:
+            return Place(*options.region)
+        if not options.title:
+            return None
+        command = ["xwininfo", "-display", display, "-root", "-tree"]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=LOOKED_UP_WITHIN_S, errors="replace")
+        if done.returncode:
+            raise ValueError(f"the X server {display} cannot be used: {done.stderr.strip()}")
+        place = place_of(options.title, done.stdout)
+        if place is None:
+            raise ValueError("no window has this title or class")
+        return place
+
+    def _capture(self, display: str, place: Place | None, process: subprocess.Popen[bytes] | None) -> None:
+        """Take pictures until the scene, the program or the window's place ends."""
+        given = {"framerate": f"{self._options.rate_hz:g}", "draw_mouse": str(int(self._options.pointer))}
+        source = display
+        if place is not None:
+            given["video_size"] = f"{place.width}x{place.height}"
+            if place.window:  # captured where it is, so that nothing else is shown if it is moved or closed
+                given["window_id"] = str(place.window)
+            else:
+                source = f"{display}+{place.x},{place.y}"
+        looked_s, last = time.monotonic(), np.empty((0, 0, 3), np.uint8)
+        with av.open(source, format="x11grab", options=given) as container:
+            for frame in container.decode(video=0):
+                rgb: U8 = np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
+                self._seen_s = time.monotonic()
+                if self.problem or not np.array_equal(rgb, last):
+                    self._take(rgb)
+                    last = rgb
+                if self._ends.is_set() or (process is not None and process.poll() is not None):
+                    return
+                if self._options.title and self._seen_s - looked_s > LOOKS_EVERY_S:
+                    looked_s = self._seen_s
+                    if self._place(display) != place:
+                        return
+
+    @contextmanager
+    def _screen(self) -> Iterator[tuple[str, subprocess.Popen[bytes] | None]]:
+        """Yield the X server's name and, if the scene has a command, its process on a virtual screen."""
+        if not self._options.command:
+            yield self._options.display or os.environ["DISPLAY"], None
+            return
+        reading, writing = os.pipe()
+        size = "{}x{}x24".format(*self._options.size_px)
+        server = subprocess.Popen(
+            ["Xvfb", "-displayfd", str(writing), "-screen", "0", size, "-nolisten", "tcp"],
+            pass_fds=(writing,),
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        os.close(writing)
+        process: subprocess.Popen[bytes] | None = None
+        try:
+            with os.fdopen(reading, "rb") as told:
+                display = f":{told.readline().decode().strip()}"
+            if display == ":":
+                raise ValueError("the virtual screen did not start")
+            environment = os.environ | {"DISPLAY": display}
+            process = subprocess.Popen(
+                self._options.command, env=environment, stdin=subprocess.DEVNULL, start_new_session=True
+            )
+            yield display, process
+        finally:
+            for one in (process, server):
+                if one is not None:
+                    _ended(one)
+
+
+def _ended(process: subprocess.Popen[bytes]) -> None:
+    """End a process and those that it started."""
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, 15)
+    try:
+        process.wait(1.0)
+    except subprocess.TimeoutExpired:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, 9)
+        process.wait()

@@ -1,0 +1,160 @@
+"""Tests `scene = "window"` with windows on a virtual X server."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from runtime.config import ContentSettings, StackGeometry
+from runtime.content.registry import open_content
+from runtime.content.window import Place, place_of
+from runtime.errors import ContentFailure, InputError
+from runtime.plan.drawing import raster_views
+from tests.waiting import eventually
+
+STACK = replace(StackGeometry().stack(), width_px=64, height_px=36)
+EYES = np.array([[0.6, -0.03, 0.0], [0.6, 0.03, 0.0]])
+SHOWS_HALVES = (  # a window whose left half has one colour and whose right half another
+    "import sys, tkinter; root = tkinter.Tk(); root.title(sys.argv[1]); root.geometry(sys.argv[2])\n"
+    "for n, colour in enumerate(sys.argv[3:5]):\n"
+    "    tkinter.Frame(root, bg=colour).place(relx=n / 2, rely=0, relwidth=0.5, relheight=1)\n"
+    "root.mainloop()"
+)
+LISTED = """
+xwininfo: Window id: 0x50e (the root window) (has no name)
+
+     3 children:
+     0x200009 "A stereo player": ("player" "Player")  640x360+0+0  +20+-30
+        1 child:
+        0x20000a (has no name): ()  640x360+0+0  +20+-30
+     0x400009 "phasestack 1": ("phasestack" "phasestack")  1920x1080+0+0  +0+0
+     0x600001 "player": ("tiny" "Tiny")  1x1+-1+-1  +-1+-1
+"""
+
+needs_x = pytest.mark.skipif(
+    shutil.which("Xvfb") is None or shutil.which("xwininfo") is None, reason="needs Xvfb and xwininfo"
+)
+
+
+@pytest.fixture
+def display() -> Iterator[str]:
+    reading, writing = os.pipe()
+    command = ["Xvfb", "-displayfd", str(writing), "-screen", "0", "400x300x24"]
+    with subprocess.Popen(command, pass_fds=(writing,), stderr=subprocess.DEVNULL) as server:
+        os.close(writing)
+        with os.fdopen(reading, "rb") as told:
+            yield f":{told.readline().decode().strip()}"
+        server.kill()
+
+
+def window(display: str, title: str, geometry: str, *colours: str) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-c", SHOWS_HALVES, title, geometry, *colours]
+    return subprocess.Popen(command, env=os.environ | {"DISPLAY": display})
+
+
+def opened(**options: Any) -> Any:
+    settings = ContentSettings(scene="window", layout="side-by-side", options=options)
+    return open_content(settings, STACK, None)
+
+
+def shows(source: Any, left: tuple[int, ...], right: tuple[int, ...]) -> bool:
+    views = raster_views(EYES, STACK.panel(1))
+    try:
+        source.expect(views, time_ns=0)
+        pictures = [source.render(view, time_ns=0)[18, 32, :3].tolist() for view in views]
+    except ContentFailure:
+        return False
+    return pictures == [list(left), list(right)]
+
+
+@needs_x
+def test_each_eye_sees_its_half_of_the_window(display: str) -> None:
+    source = opened(title="stereo", display=display)
+    assert eventually(lambda: "no window has this title" in source.problem)
+    first = window(display, "A Stereo window", "160x90+100+50", "#ff0000", "#0000ff")
+    assert eventually(lambda: shows(source, (255, 0, 0), (0, 0, 255)) and source.problem == "")
+    first.kill()
+    first.wait()
+    assert eventually(lambda: "no window has this title" in source.problem)
+    assert shows(source, (255, 0, 0), (0, 0, 255))  # the last picture stays
+    second = window(display, "stereo again", "300x200+10+10", "#00ff00", "#ffff00")  # larger, elsewhere
+    assert eventually(lambda: shows(source, (0, 255, 0), (255, 255, 0)) and source.problem == "")
+    second.kill()
+    second.wait()
+    source.close()
+
+
+@needs_x
+def test_a_picture_that_does_not_change_is_not_solved_again(display: str) -> None:
+    source = opened(region=(0, 0, 64, 36), display=display)
+    assert eventually(lambda: source.revision(time_ns=0) == 1)
+    assert not eventually(lambda: source.revision(time_ns=0) > 1, within_s=1.0) and source.problem == ""
+    source.close()
+
+
+@needs_x
+def test_a_command_has_a_screen_of_its_own_and_ends_with_the_scene(tmp_path: Path) -> None:
+    told = str(tmp_path / "pid")
+    script = f"import os; open({told!r}, 'w').write(str(os.getpid()))\n" + SHOWS_HALVES
+    command = [sys.executable, "-c", script, "any", "200x100+0+0", "#00ffff", "#ff00ff"]
+    source = opened(command=command, size_px=(200, 100))
+    assert eventually(lambda: shows(source, (0, 255, 255), (255, 0, 255)))
+    first = int(Path(told).read_text())
+    os.kill(first, signal.SIGKILL)
+    assert eventually(lambda: "ended with exit status -9" in source.problem)
+    assert eventually(lambda: shows(source, (0, 255, 255), (255, 0, 255)) and source.problem == "")
+    last = int(Path(told).read_text())
+    source.close()
+    assert last != first and eventually(lambda: not Path(f"/proc/{last}").exists())
+
+
+@needs_x
+def test_an_x_server_that_ends_is_told(display: str) -> None:
+    source = opened(title="any", display=":4711")
+    assert eventually(lambda: "the X server :4711 cannot be used" in source.problem)
+    source.close()
+
+
+def test_the_largest_window_with_the_title_or_class_is_found() -> None:
+    assert place_of("PLAYER", LISTED) == Place(20, -30, 640, 360, 0x200009)
+    assert place_of("Tiny", LISTED) == Place(-1, -1, 1, 1, 0x600001)
+    assert place_of("nothing", LISTED) is None
+
+
+@needs_x
+def test_our_own_panels_are_never_found(display: str) -> None:
+    panel = (
+        "import glfw, time; from runtime.panels import display; glfw.init(); display._hints()\n"
+        "glfw.window_hint(glfw.CLIENT_API, glfw.NO_API); glfw.create_window(200, 100, 'panel 1', None, None)\n"
+        "print('open', flush=True); time.sleep(60)"
+    )
+    command, environment = [sys.executable, "-c", panel], os.environ | {"DISPLAY": display}
+    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None and process.stdout.readline() == b"open\n"
+        listed = subprocess.run(["xwininfo", "-root", "-tree", "-display", display], capture_output=True, text=True)
+        process.kill()
+    assert '"panel 1": ("phasestack" "phasestack")' in listed.stdout
+    assert place_of("panel", listed.stdout) is None and place_of("phasestack", LISTED) is None
+
+
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        ({}, "set one of title, region and command"),
+        ({"title": "a", "region": (0, 0, 10, 10)}, "set one of title, region and command"),
+        ({"region": (0, 0, 0, 10)}, "region: must be left, top, width, height"),
+    ],
+)
+def test_wrong_options_are_one_line(options: dict, why: str) -> None:
+    with pytest.raises(InputError, match=why):
+        opened(**options)
