@@ -46,7 +46,7 @@ BAYER = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]])
 
 @dataclass(frozen=True, slots=True)
 class AngleRange:
-    """Angles by which a panel turns the polarization. They are found by turning an analyser to the darkest position."""
+    """Angles by which a panel turns the polarization, measured with an analyser."""
 
     black_deg: float = 0.0
     white_deg: float = 90.0

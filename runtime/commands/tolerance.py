@@ -20,7 +20,7 @@ def tolerance(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print the result as a JSON object")] = False,
 ) -> None:
-    """Measure what each imperfection of real panels costs, from misalignment to slow pixels, and crosstalk.
+    """Measure the cost of each imperfection of real panels, crosstalk, and viewing freedom.
 
     The layers are computed for ideal panels, then seen through simulated real ones. The page is written after the first
     look, and completed as the curves are measured. The sizes assumed are those of three 27-inch monitors that are

@@ -1,4 +1,4 @@
-"""Crosstalk between the eyes, luminance uniformity, and the region from which the picture is good, on ideal panels.
+"""Crosstalk between the eyes, luminance uniformity and viewing freedom, on ideal panels.
 
 Crosstalk is (L_dark - L_black) / (L_bright - L_black): one eye should see a white patch, the other eye black (Woods, J.
 Electron. Imaging 21 (2012) 040902). Standards measure it with patches that fill the display (IEC 62629-22-1; IDMS of
@@ -53,14 +53,14 @@ def reduced(stack: PanelStack) -> PanelStack:
 
 
 def parallax_m(stack: PanelStack, eyes_m: F64) -> float:
-    """Return by how much each eye sees an outer panel shifted on the middle plane, s_n of docs/mathematics.md."""
+    """Return an outer panel's parallax for each eye on the middle plane (docs/mathematics.md)."""
     middle = eyes_m.mean(axis=0)
     gap_m = (stack.x_m[-1] - stack.x_m[0]) / 2
     return float(np.linalg.norm(eyes_m[1] - eyes_m[0]) / 2 * gap_m / middle[0])
 
 
 def theory_percent(width_m: float, parallax: float) -> float:
-    """Return the crosstalk of a patch by the limits of three panels, in percent (docs/mathematics.md, Crosstalk)."""
+    """Return a patch's least crosstalk on three panels, in percent (docs/mathematics.md)."""
     difference = min(1.0, 4 * parallax / width_m)
     return 100 * (1 - math.sin(math.pi / 2 * difference)) / (1 + math.sin(math.pi / 2 * difference))
 
@@ -74,7 +74,7 @@ class Patches:
         self._is_regular = stack.count == 3 and stack.is_evenly_spaced
 
     def sizes(self) -> Iterator[Crosstalk]:
-        """Measure patches from small to the whole display, white for the left eye and black for the right eye."""
+        """Measure patches of all sizes, white for the left eye and black for the right eye."""
         whole_mm = self.stack.width_m * 1e3
         for size_mm in (*[size for size in PATCHES_MM if size < self.stack.height_m * 1e3], whole_mm):
             half = size_mm / 2e3
@@ -141,7 +141,7 @@ class Patches:
 
 
 def uniformity(falloff: float) -> float:
-    """Return the lowest luminance of nine points, divided by the highest, for a backlight that darkens outwards.
+    """Return the lowest of nine points' luminances, divided by the highest.
 
     The points lie at 10, 50 and 90 % of the width and the height. Luminance falls with the square of the distance from
     the middle, by `falloff` in the corners (`Lighting`).

@@ -1,4 +1,4 @@
-"""Cost in light of each imperfection of a stack's panels, on layers that were solved for ideal panels."""
+"""Cost in light of each imperfection of real panels, on layers solved for ideal panels."""
 
 from __future__ import annotations
 
@@ -237,8 +237,12 @@ def _filters(choice: float, stack: PanelStack) -> RealPanels:
 
 
 def cell_choice(choice: float, count: int) -> RealPanels:
-    """Return panels of a kind: 0 rotators, 1 retarders between quarter-wave films, 2 twisted nematic, 3 half-wave
-    plates, 4 half-wave plates with every other panel inverted and the analyser turned to match.
+    """Return panels with a kind of cell.
+
+    Args:
+        choice: 0: rotators; 1: retarders between quarter-wave films; 2: twisted nematic cells; 3: half-wave plates;
+            4: half-wave plates with every other panel inverted and the analyser turned to match.
+        count: Number of panels.
     """
     if choice == 4:
         plates = tuple(Cell("half-wave", inverted=n % 2 == 1) for n in range(count))

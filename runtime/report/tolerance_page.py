@@ -1,4 +1,4 @@
-"""Run of `phasestack tolerance`: measures everything, and writes its page and tolerance.json as results come in."""
+"""Run of `phasestack tolerance`, which writes its page and tolerance.json as results come in."""
 
 from __future__ import annotations
 

@@ -152,7 +152,7 @@ def test_six_bits_round_to_64_levels() -> None:
     assert len(np.unique(angles)) == 64
 
 
-def test_contrast_of_a_cell_and_of_polarizers_is_that_of_black_and_white() -> None:
+def test_contrast_is_the_ratio_of_white_to_black() -> None:
     assert black_level([Cell(contrast=500.0)], math.inf) == pytest.approx(1 / 500)
     assert black_level([Cell()], 2000.0) == pytest.approx(1 / 2000)
 
@@ -273,7 +273,7 @@ def test_a_late_panel_shows_the_previous_frame_for_its_delay() -> None:
     assert ages == [1, 1, 0, 0]
 
 
-def test_a_panel_mounted_upside_down_is_out_of_step_at_the_edges_only() -> None:
+def test_a_panel_mounted_upside_down_is_out_of_step_at_edges() -> None:
     timing = Timing(scan=1.0, bottom_up=(False, False, True))
     rows = np.array([0.01, 0.5, 0.99])
     front = np.array([lags.of(2, rows)[1] for lags in moments(STACK, timing)]).mean(axis=0)

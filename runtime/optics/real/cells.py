@@ -123,7 +123,7 @@ def retarder(delta_rad: ArrayLike, axis_rad: ArrayLike) -> C128:
 
 
 def retarder_between_quarter_waves(angle_rad: ArrayLike, dispersion: float = 1.0) -> C128:
-    """Return the matrices (..., 2, 2) of variable retarders at 0 degrees between quarter-wave plates at ±45 degrees.
+    """Return the matrices (..., 2, 2) of retarders at 0° between quarter-wave plates at ±45°.
 
     This is how a cell with vertical or parallel alignment becomes a rotator: a retardance of twice the angle turns
     any polarization by the angle, without residue where the plates are exact. The cell's own dispersion is left out

@@ -125,7 +125,7 @@ class _View:
     mask: F32  # (pixels,) 1 for a pixel that counts
 
     def errors(self, white: F64, veil: float) -> F32:
-        """Return the squared errors (P, 3), given full white in each band and the room light's share of white."""
+        """Return the squared errors (P, 3), given full white per band and the room light's share."""
         first, second = (self.light / white.astype(np.float32) + np.float32(veil)) / np.float32(1 + veil) - self.target
         return np.asarray(first * second)
 

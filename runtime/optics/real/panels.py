@@ -1,4 +1,4 @@
-"""Imperfections of a stack of real panels, as records. The defaults describe the solver's ideal panels."""
+"""Records of a real stack's imperfections. The defaults describe the solver's ideal panels."""
 
 from __future__ import annotations
 
@@ -56,10 +56,10 @@ class Lighting:
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """Response of the panels while the alignment moves their pictures with a head that moves to the right."""
+    """Response of the panels while the alignment moves their pictures with a moving head."""
 
     rate_hz: float = 60.0  # refresh rate
-    head_m_s: float = 0.1  # the head's speed
+    head_m_s: float = 0.1  # the head's speed to the right
     response_ms: float = 0.0  # time constant of the first-order response (10 % to 90 % takes 2.2 of them)
     scan: float = 0.0  # share of a refresh that passes from the first row's update to the last row's
     bottom_up: tuple[bool, ...] = ()  # which panels are updated from the bottom row, as one mounted upside down is
@@ -78,7 +78,7 @@ class Timing:
 
 @dataclass(frozen=True, slots=True)
 class RealPanels:
-    """A stack of real panels. Each of `cells` and `placement` has one entry for all panels, or one for each."""
+    """A stack of real panels. `cells` and `placement` have one entry for all panels, or one each."""
 
     cells: tuple[Cell, ...] = (Cell(),)
     placement: tuple[Placement, ...] = (Placement(),)

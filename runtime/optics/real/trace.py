@@ -27,7 +27,7 @@ ORDERS = 6.0  # diffraction is drawn up to this many times the angle of a slit's
 
 @dataclass(frozen=True, slots=True)
 class Crossings:
-    """Points where rays cross each panel, in the panel's pixels; each array has shape (N, P), panels from the rear."""
+    """Points where rays cross each panel, in pixels. Arrays have shape (N, P), rear panel first."""
 
     u: F64
     v: F64
@@ -116,7 +116,7 @@ def _scattered(
 
 
 def subpixel_m(stack: PanelStack, aperture: float) -> tuple[float, float]:
-    """Return the open width and height of a subpixel, a third of a pixel wide, with equal shares of both open."""
+    """Return the open width and height of a subpixel, which is a third of a pixel wide."""
     side = math.sqrt(aperture)
     return stack.width_m / stack.width_px / 3 * side, stack.height_m / stack.height_px * side
 
@@ -129,7 +129,7 @@ def _diffraction_table() -> tuple[F64, F64]:
 
 
 def diffraction_orders(random: F64) -> F64:
-    """Return angles, in units of wavelength/width, distributed as light behind a slit: sinc² (Fraunhofer).
+    """Return angles in units of wavelength/width, distributed as behind a slit (sinc², Fraunhofer).
 
     Args:
         random: Numbers evenly distributed from 0 to 1.
@@ -160,7 +160,7 @@ class Tables:
             self._full = self._full_white()
 
     def light(self, crossed: Crossings, eye_x_m: float) -> tuple[F32, F32]:
-        """Return each ray's light (P, 3), and its light if all panels were white (P, 3) (or (1, 1), the same for all).
+        """Return each ray's light (P, 3), and its light through white panels, (P, 3) or (1, 1).
 
         Args:
             crossed: Where the rays cross the panels.
@@ -244,7 +244,7 @@ class Tables:
 
 
 def black_level(cells: Sequence[Cell], polarizer_contrast: float) -> float:
-    """Return the light of perfectly crossed polarization, divided by that of perfectly parallel polarization.
+    """Return the light of crossed polarization, divided by that of parallel polarization.
 
     Cells depolarize shares of the light, half of which passes. Real polarizers pass 1/contrast when crossed.
     """
@@ -281,7 +281,7 @@ class Lags:
         return np.stack([late + (-down if up else down) for late, up in zip(self.late, bottom_up, strict=True)])
 
     def of(self, index: int, row_share: F64) -> tuple[F64, F64]:
-        """Return the weights (frames, P) of successive frames, newest first, and the newest one's age in frames (P,).
+        """Return the frames' weights (frames, P), newest first, and the newest frame's age (P,).
 
         Args:
             index: Panel.
@@ -300,14 +300,14 @@ class Lags:
 
 
 def moments(stack: PanelStack, timing: Timing) -> list[Lags]:
-    """Return the panels' states at moments spread over a refresh, or one state if nothing depends on time."""
+    """Return the panels' states at moments of a refresh, or one state if nothing depends on time."""
     late = tuple(ms * timing.rate_hz / 1e3 for ms in timing.late_ms) or (0.0,) * stack.count
     places = [0.0] if timing.is_still else (np.arange(MOMENTS) + 0.5) / MOMENTS
     return [Lags(float(place), timing, late) for place in places]
 
 
 def frame_step_px(stack: PanelStack, timing: Timing, index: int, eye_x_m: float) -> float:
-    """Return how many pixels to the right the alignment moves a panel's picture per refresh (docs/mathematics.md)."""
+    """Return by how many pixels to the right the alignment moves a panel's picture per refresh."""
     count = stack.count
     reference = (stack.x_m[(count - 1) // 2] + stack.x_m[count // 2]) / 2
     shift_m = (stack.x_m[index] - reference) / (eye_x_m - reference) * timing.step_m
