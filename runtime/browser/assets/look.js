@@ -61,6 +61,7 @@ export class Look {
     this.flatness = 0;
     this.used = null; // eyes that the panels are aligned to; null: the true eyes
     this.state = ""; // why the picture differs from what the two eyes should see
+    this.live = false; // true if the daemon measures the light, and calls `tell`
     this.onhead = () => {}; // called after the head has moved
     this.onframe = () => {}; // called after a picture has been drawn
     this.onmode = () => {}; // called when a mode is chosen, with true if it needs target pictures
@@ -108,7 +109,7 @@ export class Look {
   draw() {
     this.moving = performance.now();
     this.fresh = true;
-    if (this.isMeasured) this.$(".light").textContent = this.display.targets[0] ? "…" : "";
+    if (this.isMeasured && !this.live) this.$(".light").textContent = this.display.targets[0] ? "…" : "";
     this.isMeasured = false;
     this.next ??= requestAnimationFrame((now) => this.#frame(now));
   }
@@ -128,7 +129,7 @@ export class Look {
     this.frames += 1;
     const resting = !this.fresh && performance.now() - this.moving > REST_MS, { width, height, resized } = this.#fitted(resting);
     this.fresh = false;
-    const draws = this.#draws(this.mode === "difference" ? unaligned(this.stack) : undefined);
+    const aligned = this.mode === "difference" ? unaligned(this.stack) : this.alignment, draws = this.#draws(aligned);
     this.quick = !resting && this.rays === 1 && this.flatness === 0 && !this.pupil && !this.display.isBuilt && !["panels", "apart", "target", "difference"].includes(this.mode) ? draws : null;
     if (!this.quick) this.display.show(draws);
     const turning = this.mode === "wiggle";
@@ -313,7 +314,7 @@ export class Look {
   #measure() {
     const { display, scene } = this;
     this.isMeasured = true;
-    if (!display.targets[0] || this.flatness > 0) return;
+    if (this.live || !display.targets[0] || this.flatness > 0) return;
     const { width, height } = scene.picture, picture = { width, height, fov_deg: scene.fov_deg };
     const columns = Math.floor(width / SAMPLED), rows = Math.floor(height / SAMPLED);
     display.show(this.#draws());
@@ -329,10 +330,15 @@ export class Look {
     }
     if (!counted) return void (this.$(".light").textContent = "No ray from here crosses all panels.");
     // Subtract the error due to compressing the target pictures.
-    this.light_db = -10 * Math.log10(Math.max(error / counted - (scene.target_error ?? 0), 1e-9));
+    this.tell(-10 * Math.log10(Math.max(error / counted - (scene.target_error ?? 0), 1e-9)));
+  }
+
+  // Show the PSNR of the light at both eyes, followed by `note`.
+  tell(light_db, note = "") {
+    this.light_db = light_db;
     const words = this.light_db > 33 ? "hard to distinguish from the target" : this.light_db > 27 ? "a good picture with faint traces of the other layers" :
       this.light_db > 21 ? "obvious ghosts and coloured edges" : "the layers fall apart";
-    this.$(".light").textContent = `Light at both eyes: ${this.light_db.toFixed(1)} dB against the target (${words}).`;
+    this.$(".light").textContent = `Light at both eyes: ${this.light_db.toFixed(1)} dB against the target (${words})${note}.`;
   }
 
   #modes() {
