@@ -205,7 +205,7 @@ class Solution:
     effort: Effort | None = None  # None: a flat picture
     measures: Measures | None = None
     relief: F32 | None = None  # (h, w) relief of the content on the middle panel (`optics.relief`); None: unknown
-    state_version: int = 0  # the run's state that it was computed with (`RunState.version`)
+    state_version: int = 0  # the solver's state that it was computed with (`Facts.version`)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,8 +1,8 @@
-"""Runs the daemon with delays in its threads, four clients that change it, and losses of the sensor.
+"""Runs the daemon with four clients that change it, losses of the sensor, and solvers that are stopped or killed.
 
     python -m tests.soak --seconds 1200
-    python -m tests.soak --seconds 3600 --windows    # on an X server with OpenGL's solver; cables are pulled, contexts
-                                                     # lost, and solvers fail
+    python -m tests.soak --seconds 3600 --windows    # on an X server with OpenGL's solver; cables are pulled,
+                                                     # and contexts lost
 
 Fails where it ends otherwise than tracking, where a request gets no answer, and where memory, files or threads grow.
 """
@@ -29,18 +29,18 @@ import psutil
 
 from runtime.config import Settings
 from runtime.content.scenes import SCENES
-from runtime.daemon import changes, reconfigure, solver_parts, supervise
+from runtime.daemon import changes, supervise
 from runtime.daemon.build import RunOptions
 from runtime.daemon.client import ask
 from runtime.errors import SensorLost
-from runtime.frame import solver_thread
+from runtime.frame import solver_process
 from runtime.panels import window
 from runtime.sensor.replay import ReplayDriver
 from tests.panels.xserver import HEIGHT_PX, WIDTH_PX, XServer
 
 LOST_EVERY_S = 30.0
 HARM_EVERY_S = 40.0  # a cable, or the panels' contexts
-FAILING = 0.002  # of the solver's steps
+KILLED_EVERY_S = 12.0  # on average
 REFUSED = (
     "superseded by a newer change",
     "there is no next entry",
@@ -48,11 +48,7 @@ REFUSED = (
     "the display loop did not answer",
     "restarted",
 )
-DELAYS = (
-    (solver_parts.RunningSolver, "step", 0.02, 2.5), (solver_parts.RunningSolver, "close", 0.3, 1.5),
-    (solver_parts, "prepare_content", 0.3, 2.5), (reconfigure, "prepare_content", 0.3, 2.5),
-    (reconfigure.Reconfiguration, "_take_over", 0.3, 2.5), (changes.Changes, "carry_on", 0.05, 0.3),
-)  # fmt: skip  # where, how often, seconds at most
+HOW = (signal.SIGSEGV, signal.SIGKILL, signal.SIGABRT, signal.SIGSTOP)
 SETTINGS: dict[str, Any] = {
     "stack": {"width_px": 64, "height_px": 36},
     "sensor": {"driver": "replay", "source": "demo", "loop": True},
@@ -94,14 +90,15 @@ class Soak:
 
         return arrived
 
-    def failing(self, step: Callable[..., Any]) -> Callable[..., Any]:
-        def fails(*given: Any) -> Any:
-            if random.random() < FAILING and time.monotonic() < self._end_s - 60.0:
+    def kill(self) -> None:
+        """Stop or kill a solver now and then."""
+        while time.monotonic() < self._end_s - 40.0:
+            time.sleep(random.expovariate(1 / KILLED_EVERY_S))
+            processes = ask([self.socket], {"command": "status"}).get("processes", [])
+            pids = [process["pid"] for process in processes if process["role"] == "solver" and process["pid"]]
+            for pid in pids:
                 self.failures += 1
-                raise RuntimeError("soaked")
-            return step(*given)
-
-        return fails
+                os.kill(pid, random.choice(HOW))
 
     def reset(self, status: Callable[[], str]) -> Callable[[], str]:
         def lost() -> str:
@@ -161,27 +158,25 @@ def soak(seconds: float, *, growth_mib: int, windows: bool = False) -> None:
         folder = Path(cleanup.enter_context(tempfile.TemporaryDirectory(prefix="ps-")))
         run = Soak(folder, seconds)
         cleanup.enter_context(patch.dict(os.environ, STATE_DIRECTORY=str(folder)))
-        for owner, name, share, most_s in DELAYS:
-            cleanup.enter_context(patch.object(owner, name, run.delayed(getattr(owner, name), share, most_s)))
+        slow = run.delayed(changes.Changes.carry_on, 0.05, 0.3)
+        cleanup.enter_context(patch.object(changes.Changes, "carry_on", slow))
         cleanup.enter_context(patch.object(ReplayDriver, "read_arrived", run.losing(ReplayDriver.read_arrived)))
-        cleanup.enter_context(patch.multiple(solver_thread, LATE_S=0.3, ABANDON_S=5.0 if windows else 1.0))
+        cleanup.enter_context(patch.object(solver_process, "LATE_S", 0.3))
         service = {"socket": str(run.socket), "blackbox_minutes": 0.2}
         settings = Settings.model_validate({**SETTINGS, **(ON_WINDOWS if windows else {}), "service": service})
-        beside = [threading.Timer(8.0, run.client, (number,)) for number in range(4)]
-        beside.append(threading.Thread(target=run.watch))
+        beside: list[threading.Thread] = [threading.Timer(8.0, run.client, (number,)) for number in range(4)]
+        beside += [threading.Thread(target=run.watch), threading.Timer(10.0, run.kill)]
         if windows:
             server = XServer(folder)
             cleanup.callback(server.stop)
             cleanup.enter_context(patch.dict(os.environ, DISPLAY=server.name))
-            parts = solver_parts.RunningSolver
-            cleanup.enter_context(patch.object(parts, "step", run.failing(parts.step)))
             cleanup.enter_context(patch.object(window, "_reset_status", run.reset(window._reset_status)))
             beside.append(threading.Timer(8.0, run.harm, (server,)))
         for thread in beside:
             thread.daemon = True
             thread.start()
         print(supervise.run_daemon(lambda: settings, RunOptions()))
-    print(run.last["state"], run.lost, "losses", run.failures, "failures", run.harms, "cables and resets")
+    print(run.last["state"], run.lost, "losses", run.failures, "solvers killed", run.harms, "cables and resets")
     print(run.last["faults"], dict(run.answers))
     assert run.last["state"] in ("tracking", "holding", "flat") and set(run.answers) <= {"ok", *REFUSED}
     assert windows or run.last["dropped"] == 0

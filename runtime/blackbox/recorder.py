@@ -174,7 +174,7 @@ class Recorder(logging.Handler):
         """
         self._presenter = presenter
         if in_stack_frame:
-            self._sensor_from_stack = np.asarray(np.linalg.inv(presenter.run_cell.state.calibration.stack_from_sensor))
+            self._sensor_from_stack = np.asarray(np.linalg.inv(presenter.state.calibration.stack_from_sensor))
         for name in ROOTS:
             logging.getLogger(name).addHandler(self)
 
@@ -324,7 +324,7 @@ class Recorder(logging.Handler):
 
 def _head(presenter: Presenter) -> tuple[RecordingHeader, str]:
     """Return the recording header, and the settings as JSON, to be written before a file's messages."""
-    settings = presenter.run_cell.state.settings
+    settings = presenter.state.settings
     header = RecordingHeader(settings.sensor.driver, presenter.samples.serial)
     return header, without_secrets(settings.model_dump_json())
 

@@ -64,8 +64,8 @@ def _interrupted(number: int, frame: FrameType | None) -> None:
 
 
 def _has_hung_thread() -> bool:
-    """Return True if a solver thread (`frame.solver_thread`) or a background job is still running."""
-    return any(thread.name.startswith(("solver-", "job ")) for thread in threading.enumerate())
+    """Return True if a background job is still running."""
+    return any(thread.name.startswith("job ") for thread in threading.enumerate())
 
 
 def _code_of(app: Any) -> int:

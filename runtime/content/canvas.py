@@ -13,7 +13,6 @@ import numpy as np
 from runtime.content.base import WHITE, ContentInfo, ContentSource, View
 from runtime.optics.rect import PixelRect
 from runtime.records import F32, U8
-from runtime.support.background import raise_if_abandoned
 from runtime.support.gl import DrawnPicture, finish
 
 SIDES = 2
@@ -158,7 +157,6 @@ class CanvasSource(ContentSource):
 
         The picture stays valid until another picture is drawn for the same side.
         """
-        raise_if_abandoned()
         self._bounds[view.side] = None
         target = self._target(view.width_px, view.height_px)
         plain = target.plain[view.side]

@@ -27,7 +27,6 @@ from runtime.content.placing import SceneFile
 from runtime.content.ply import read_header
 from runtime.optics.rect import PixelRect
 from runtime.records import F32, F64
-from runtime.support.background import raise_if_abandoned
 from runtime.support.gl import DrawnPicture
 
 CUSTOM, CUSTOM_SPZ = ("-y", "-z"), ("+y", "+z")  # axes (up, to the viewer); trainers use OpenCV's camera axes
@@ -105,7 +104,6 @@ class SplatSource(CanvasSource):
             self.context.enable_only(self.context.BLEND)
             self.context.blend_func = OVER
             for first in range(0, count, AT_ONCE):
-                raise_if_abandoned()
                 if first:
                     self._buffer.orphan()  # the GPU may still be reading the previous storage
                 self._vertices.render(vertices=6 * self._prepare(view, splats, slice(first, first + AT_ONCE)))

@@ -21,7 +21,6 @@ from runtime.content.parts import OPAQUE_FROM, OUTLINED_MAX, Part, Sampler
 from runtime.content.shapes import solid_winding
 from runtime.optics.rect import PixelRect
 from runtime.records import F32, F64, U8
-from runtime.support.background import raise_if_abandoned
 from runtime.support.gl import DrawnPicture, set_uniforms
 
 PROJECTED_MAX = 5000  # if a part has more vertices, its box is projected instead to find its extent
@@ -201,7 +200,6 @@ class DrawnPart:
         Large parts are drawn in several calls, because a software rasteriser holds Python's lock during each call.
         """
         for first in range(0, self.corner_count, 3 * DRAWN_AT_ONCE):
-            raise_if_abandoned()
             self.surface.render(first=first, vertices=min(3 * DRAWN_AT_ONCE, self.corner_count - first))
 
     def release(self) -> None:
@@ -376,7 +374,6 @@ class TriangleSource(CanvasSource):
 
     def _program(self, features: tuple[str, ...]) -> Any:
         if features not in self._programs:
-            raise_if_abandoned()
             head = "#version 330\n" + "".join(f"#define {name}\n" for name in features)
             shaders = {"vertex_shader": head + VERTEX, "fragment_shader": head + FRAGMENT}
             self._programs[features] = self.context.program(**shaders)

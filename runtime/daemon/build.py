@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import gc
 import logging
-import sys
+import os
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
@@ -16,8 +15,9 @@ import cv2
 from runtime.browser.link import BrowserLink
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock, MonotonicClock, SimulatedClock
 from runtime.config import Settings
+from runtime.daemon import solver_worker
 from runtime.daemon.pose import PoseSender
-from runtime.daemon.solver_parts import RunningSolver, SolverMaker
+from runtime.daemon.solver_parts import RunningSolver, SolverSetup
 from runtime.errors import InputError, PanelLost, Stopped
 from runtime.eyes.calibration import load_calibration
 from runtime.eyes.detect import EyeFinder
@@ -25,14 +25,16 @@ from runtime.frame.kept_light import Output
 from runtime.frame.observer import RunObserver
 from runtime.frame.pacing import Pacer
 from runtime.frame.presenter import Presenter, Supervisor
+from runtime.frame.run_state import RunState
 from runtime.frame.solver_host import SimulatedSolver, SolverHost
-from runtime.frame.solver_thread import SolverThread
+from runtime.frame.solver_process import Known, SolverProcess
 from runtime.frame.targets import TargetDrawer
 from runtime.frame.viewer import Viewer
+from runtime.model.backends import Wanted
 from runtime.optics.stack import PanelStack
 from runtime.panels.base import PanelSink
 from runtime.panels.registry import BrowserPanels, open_panels
-from runtime.plan.savings import Saving
+from runtime.plan.savings import OPTIONAL_PARTS, Saving, make_plan
 from runtime.records import Effort, RefreshAccount
 from runtime.sensor.base import Sensor
 from runtime.sensor.browser import BrowserCamera, BrowserEyes
@@ -41,11 +43,13 @@ from runtime.sensor.samples import FindEyes, RecordedSamples, Samples
 from runtime.sensor.worker import SensorWorker
 from runtime.support.background import before_all_others
 from runtime.support.gl import offscreen_context
-from runtime.support.untrusted_input import LIMITS
+from runtime.support.untrusted_input import MIB
 
 log = logging.getLogger("phasestack.build")
 
-SWITCH_INTERVAL_S = 0.0005  # Python's thread switch interval, short so that the presenter can resume quickly
+STEP_S = 10.0  # a solver that needs longer for a solution has hung
+MACHINE_BYTES = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+SOLVER_MEMORY_BYTES = round(0.75 * MACHINE_BYTES) // MIB * MIB  # without the memory shared with the presenter
 
 # Figures in summary.json that are determined by the configuration if the clock is simulated.
 SIMULATED_FIGURES = (
@@ -71,24 +75,19 @@ class RunOptions:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """A run built by `build_run`, with access to its solver, savings and summary."""
+    """A run built by `build_run`, with access to its savings and summary."""
 
     presenter: Presenter
     observer: RunObserver
-    maker: SolverMaker
     simulated: bool
-
-    @property
-    def parts(self) -> RunningSolver:
-        """The latest solver, with its OpenGL context and backend."""
-        assert self.maker.parts is not None
-        return self.maker.parts
 
     def plan_items(self) -> list[dict[str, Any]]:
         """Return the savings in use as dictionaries. Any time or cost that was not measured is None."""
-        solver = self.parts.solver
-        known = replace(solver.measured, reuse=Saving(saves_ms=self.presenter.stats.reuse_saves_ms()))
-        return [asdict(item) for item in solver.plan_items(known)]
+        facts, live = self.presenter.solver.facts, self.presenter.solver.live
+        known = replace(live.measured, reuse=Saving(saves_ms=self.presenter.stats.reuse_saves_ms()))
+        loaded = OPTIONAL_PARTS.keys() - facts.absent
+        plan = make_plan(facts.info, facts.settings, seeing=live.seeing, measured=known, loaded_modules=loaded)
+        return [asdict(item) for item in plan.items]
 
     def summary(self) -> dict[str, Any]:
         """Return the contents of summary.json (docs/contracts.md)."""
@@ -97,8 +96,8 @@ class Run:
             "configured": list(SIMULATED_FIGURES) if self.simulated else [],  # figures that were not measured
             **self.presenter.summary(simulated=self.simulated),
             **self.observer.summary(),
-            "backend": self.presenter.run_cell.state.predictor.backend,
-            "scene": self.presenter.run_cell.state.content.info.name,
+            "backend": self.presenter.solver.facts.backend,
+            "scene": self.presenter.solver.facts.info.name,
             "plan": self.plan_items(),
         }
 
@@ -188,6 +187,13 @@ def build_run(
     if simulated:
         samples = RecordedSamples(driver)
         cleanup.callback(samples.close)
+    solver: SolverHost
+    if not simulated:  # first, because it starts while the panels are being opened
+        lost: list[PanelSink] = []
+        solver = process = start_solver(
+            settings, stack, clock, contexts_lost=lambda: sum(sink.contexts_lost for sink in lost)
+        )
+        cleanup.callback(solver.close)
     host.starting("creating the OpenGL context")
     context = offscreen_context()
     cleanup.callback(context.release)
@@ -197,32 +203,21 @@ def build_run(
         else BrowserPanels(options.browser, clock)
     )
     cleanup.callback(panels.close)
-    maker = SolverMaker(settings, stack, calibration, contexts_lost=lambda: panels.contexts_lost)
-    solver: SolverHost
     if simulated:
-        solver = SimulatedSolver(maker(context=context, simulated=True), clock)
+        solver = SimulatedSolver(RunningSolver(SolverSetup(settings, stack, simulated=True), context=context), clock)
         cleanup.callback(solver.close)
     else:
-        sys.setswitchinterval(SWITCH_INTERVAL_S)
-        solver = thread = SolverThread(maker, clock)
-        cleanup.callback(solver.close)
-        thread.wait_ready(lambda: host.starting("loading the scene and the model"), max_s=LIMITS.start_s)
+        lost.append(panels)
+        process.wait_ready(lambda: host.starting("loading the scene and the model"))
+        if not process.is_known:
+            raise Stopped("stopped during startup")
         samples = worker = SensorWorker(make_driver, settings.sensor, clock, make_find)
         cleanup.callback(worker.close)
         worker.start()
-    if maker.run is None:
-        raise Stopped("stopped during startup")
     in_stack_frame = driver.capabilities.in_stack_frame
-    run_cell = maker.run
-    drawer = TargetDrawer(
-        solver,
-        stack,
-        fov_deg=lambda: run_cell.state.settings.content.fov_deg,
-        shown_content=lambda: run_cell.state.content,
-    )
     observer = RunObserver(
         stack,
-        drawer,
+        TargetDrawer(solver),
         evaluate_every=settings.loop.evaluate_every if options.measure else None,
         keep_light=options.keep_light,
         output=output,
@@ -240,7 +235,7 @@ def build_run(
         pose.append(PoseSender(settings.pose))
         cleanup.callback(pose[0].close)
     presenter = Presenter(
-        maker.run,
+        RunState(0, settings, calibration),
         stack,
         clock=clock,
         pacer=pacer,
@@ -256,14 +251,41 @@ def build_run(
     if host.recorder is not None:
         host.recorder.watches(presenter, in_stack_frame=in_stack_frame)
     if not simulated:
-        # Keep the libraries' objects out of garbage collection, which would stop all threads for several refreshes.
-        gc.collect()
-        gc.freeze()
-        cleanup.callback(gc.unfreeze)
         cleanup.enter_context(before_all_others())  # affects only this thread, because all others have already started
-    run = Run(presenter, observer, maker, simulated)
+    run = Run(presenter, observer, simulated)
     host.watches(run)
     return run
+
+
+def start_solver(
+    settings: Settings, stack: PanelStack, clock: Clock, *, contexts_lost: Callable[[], int]
+) -> SolverProcess:
+    """Start a solver's process.
+
+    Args:
+        settings: The run's first settings.
+        stack: The run's panels.
+        clock: The run's clock.
+        contexts_lost: Function that returns the number of GL contexts lost by the panels.
+    """
+
+    def setup(known: Known) -> SolverSetup:
+        if known.facts is None:
+            return SolverSetup(settings, stack, step_s=STEP_S)
+        facts = known.facts
+        device: Wanted = "gl" if facts.backend == "gl" else "cpu"
+        return SolverSetup(
+            facts.settings,
+            stack,
+            device=device,
+            version=facts.version,
+            scene=facts.scene,
+            first_number=known.next_number,
+            costs=known.first,
+            step_s=STEP_S,
+        )
+
+    return SolverProcess(solver_worker.role(SOLVER_MEMORY_BYTES), stack, setup, clock, contexts_lost=contexts_lost)
 
 
 def _open_panels(settings: Settings, stack: PanelStack, clock: Clock, context: Any, host: Host) -> PanelSink:

@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from operator import attrgetter
-from queue import SimpleQueue
+from pathlib import Path
 from typing import Any
 
 from runtime.config import Settings, changed
-from runtime.content.placed import placed_source, placing_of
 from runtime.daemon import status
 from runtime.daemon.commands import PLACING, Command
-from runtime.daemon.reconfigure import Reconfiguration, moved_since
+from runtime.daemon.reconfigure import moved_since
 from runtime.errors import InputError, PhasestackError
+from runtime.eyes.calibration import Calibration, load_calibration
+from runtime.frame.messages import Answer, Cancel, ChangeSettings, Done, Move, Order, Progress, Skip
 from runtime.frame.presenter import Presenter
+from runtime.support.background import BackgroundJob
+from runtime.support.untrusted_input import LIMITS
 
 log = logging.getLogger("phasestack.daemon")
 
+SUPERSEDED = "superseded by a newer change"
 NEEDS_RESTART = (
     "stack",
     "sensor",
@@ -79,108 +84,102 @@ def _value(settings: Settings, at: tuple[str, str]) -> Any:
 
 
 @dataclass(slots=True)
-class _Change:
-    """A change of settings requested by a command."""
+class _Loading:
+    """A change of settings requested by a command. Created and written only on the presenter's thread."""
 
     command: Command
-    choose: Callable[[Choices], Choices]  # returns the new choices; called on the loading thread; may raise InputError
+    choose: Callable[[Choices], Choices]  # returns the new choices; called on the reading thread; may raise InputError
     reload_content: bool = False
-    choices: Choices | None = None  # set by the loading thread before it is done
+    reading: BackgroundJob[tuple[Choices, Settings, Calibration]] | None = None  # None: not begun
+    choices: Choices | None = None  # once they have been read
+    settings: Settings | None = None
+    calibration: Calibration | None = None
+    order: int | None = None  # number of the order to the solver; None: not sent yet
+    begun_s: float = 0.0
+    superseded: bool = False  # True if the command has already been answered
+    progress: str = ""  # what is being loaded, for the status
 
-    def settings(self, before: Choices) -> Settings:
-        """Apply the change to the previous choices, and return the new settings.
+    def read(self, before: Choices) -> tuple[Choices, Settings, Calibration]:
+        """Apply the change to the previous choices, and read what belongs to it.
 
         Raises InputError if the new settings are invalid.
         """
-        self.choices = self.choose(before)
-        return self.choices.settings()
+        choices = self.choose(before)
+        settings = choices.settings()
+        file = settings.calibration.file
+        return choices, settings, load_calibration(Path(file) if file else None)
 
 
 class Changes:
     """Carries out operators' changes to a run, loading one change at a time.
 
-    For use only on the presenter's thread. Settings are read and new parts loaded by a background job (see
-    `Reconfiguration`), and the scene is moved on the solver's thread. Both work on copies of their inputs. `carry_on`
-    polls the job and collects the results from the solver's thread. It never waits.
+    For use only on the presenter's thread. Settings are read by a background job, and new content and a new model are
+    loaded by the solver. `carry_on` polls the job, and the solver's host passes on the answers. Neither waits.
     """
 
     def __init__(self, presenter: Presenter) -> None:
         self._presenter = presenter
-        self.choices = Choices(presenter.run_cell.state.settings)
+        self.choices = Choices(presenter.state.settings)
         self.refused = ""  # why the latest change was refused; empty if it was accepted
-        self._loading: tuple[_Change, Reconfiguration] | None = None
-        self._next: _Change | None = None  # to start once the current change is over
-        self._outcomes: SimpleQueue[Callable[[], None]] = SimpleQueue()  # results from the solver's thread
+        self._loading: _Loading | None = None
+        self._next: _Loading | None = None  # to start once the current change is over
 
     @property
-    def loading(self) -> Reconfiguration | None:
-        """The change being loaded, or None."""
-        return None if self._loading is None else self._loading[1]
+    def loading(self) -> str | None:
+        """Description of what is being loaded, or None."""
+        return None if self._loading is None else self._loading.progress
 
     def carry_on(self) -> None:
-        """Process results from other threads and start the next waiting change. Called once per refresh."""
-        finished = self._loading is not None and self._loading[1].finished
-        while not self._outcomes.empty():  # first, because they may concern the scene to be replaced
-            self._outcomes.get()()
-        if self._loading is not None and finished:
-            (change, loading), self._loading = self._loading, None
-            if not loading.abandoned:
-                self._finish(change, loading)
+        """Send a change that has been read to the solver, and start the next one. Called once per refresh."""
+        loading = self._loading
+        if loading is not None and loading.order is None and loading.reading is not None and loading.reading.done:
+            self._send(loading, loading.reading)
+        elif loading is not None and loading.order is not None:
+            limit_s = LIMITS.load_s if loading.superseded else LIMITS.start_s
+            if time.monotonic() - loading.begun_s > limit_s:
+                loading.begun_s = time.monotonic()
+                self._presenter.solver.restart("was ended because it took too long to load a scene or a model")
         if self._loading is None and self._next is not None:
-            change, self._next = self._next, None
-            self.attempt(change.command, partial(self._load, change))
+            following, self._next = self._next, None
+            self.attempt(following.command, partial(self._load, following))
 
     def begin(self, command: Command, choose: Callable[[Choices], Choices], *, reload_content: bool = False) -> None:
         """Start a change, or replace one that is still loading.
 
         Args:
             command: Command to answer once the change is over.
-            choose: Function that returns the new choices, given the current ones. Called on the loading thread.
+            choose: Function that returns the new choices, given the current ones. Called on the reading thread.
             reload_content: True to reload the content even if its settings have not changed.
         """
-        change = _Change(command, choose, reload_content)
-        if self._loading is None:
-            self._load(change)
+        following = _Loading(command, choose, reload_content)
+        loading = self._loading
+        if loading is None:
+            self._load(following)
             return
-        (current, loading), waiting = self._loading, self._next
-        for skipped in (None if loading.abandoned else current, waiting):
+        for skipped in (None if loading.superseded else loading, self._next):
             if skipped is not None:
-                self.answer(skipped.command, "superseded by a newer change")
-        loading.abandon()
-        self._next = change
+                self.answer(skipped.command, SUPERSEDED)
+        if not loading.superseded and loading.order is not None:
+            self._presenter.solver.send(Cancel(loading.order))
+        loading.superseded = True
+        self._next = following
 
     def place(self, command: Command) -> None:
         """Move the scene as requested. Raises InputError if the placement is invalid.
 
-        The settings and the content are replaced together, on the solver's thread between two solutions.
+        The solver replaces the settings and the content together, between two solutions.
         """
         values = command.value or status.placing_in(self.choices.configured)
-        changed(self._presenter.run_cell.state.settings, "content", values, source="place")
-
-        def move(parts: Any) -> str:
-            state = parts.run.state
-            settings = changed(state.settings, "content", values, source="place")
-            source = placed_source(state.content, placing_of(settings.content))
-            parts.replace(settings=settings, content=source)
-            return ""
+        changed(self._presenter.solver.facts.settings, "content", values, source="place")
 
         def moved() -> None:
             self.choices = self.choices.choosing("content", **values)
 
-        self._between_steps(command, move, moved)
+        self._order(command, Move(values), moved)
 
     def skip(self, command: Command) -> None:
-        """Advance the playlist to its next entry, on the solver's thread between two solutions."""
-
-        def skip(parts: Any) -> str:
-            skipped = parts.run.state.content.skip(time_ns=self._presenter.clock.now_ns())
-            return (
-                ""
-                if skipped
-                else ("there is no next entry because the scene is not a playlist or is already at its last entry")
-            )
-
-        self._between_steps(command, skip)
+        """Advance the playlist to its next entry, between two solutions."""
+        self._order(command, Skip(self._presenter.clock.now_ns()))
 
     def attempt(self, command: Command, work: Callable[[], None]) -> None:
         """Run `work`. If it raises an exception, refuse the command and let the run continue."""
@@ -202,45 +201,57 @@ class Changes:
         else:
             command.done(**status.holds(self._presenter))
 
-    def _load(self, change: _Change) -> None:
-        present = self._presenter.run_cell.state.settings
-        read = partial(change.settings, self.choices)
-        loading = Reconfiguration(read, present, self._presenter.stack, reload_content=change.reload_content)
-        self._loading = change, loading
-        self._presenter.solver.do(loading.advance)
+    def _load(self, loading: _Loading) -> None:
+        self._loading, before = loading, self.choices
+        loading.begun_s = time.monotonic()
+        loading.reading = BackgroundJob("reconfiguration", lambda: loading.read(before))
 
-    def _finish(self, change: _Change, loading: Reconfiguration) -> None:
-        """Answer a finished change's command. If the change has taken effect, adopt its choices."""
-        if not loading.problem and change.choices is not None:
-            state = self._presenter.run_cell.state
-            moved = moved_since(loading.settings.content, state.settings.content)  # moved during loading
-            self.choices = change.choices.choosing("content", **moved)
-            log.info("now showing the scene %s with the model %s", state.content.info.name, state.predictor.name)
-        self.answer(change.command, loading.problem)
+    def _send(self, loading: _Loading, reading: BackgroundJob[tuple[Choices, Settings, Calibration]]) -> None:
+        read = reading.take()
+        if loading.superseded or read is None:
+            self._over(loading, reading.problem)
+            return
+        loading.choices, loading.settings, loading.calibration = read
 
-    def _between_steps(
-        self, command: Command, work: Callable[[Any], str], succeeded: Callable[[], None] = lambda: None
-    ) -> None:
-        """Run `work` on the solver's thread between two solutions. Then answer the command on this thread.
+        def answered(answer: Answer) -> None:
+            if isinstance(answer, Progress):
+                loading.progress = answer.text
+            elif isinstance(answer, Done):
+                self._over(loading, answer.problem)
+
+        loading.order = 0  # in case the answer comes at once
+        loading.order = self._presenter.solver.send(ChangeSettings(loading.settings, loading.reload_content), answered)
+
+    def _over(self, loading: _Loading, problem: str) -> None:
+        """Answer a finished change's command. If the change has taken effect, adopt its settings and choices."""
+        self._loading = None
+        facts = self._presenter.solver.facts
+        if not problem and loading.choices is not None and loading.settings is not None:
+            self._presenter.adopt(facts.settings, loading.calibration)
+            moved = moved_since(loading.settings.content, facts.settings.content)  # moved during loading
+            if not loading.superseded:
+                self.choices = loading.choices.choosing("content", **moved)
+            log.info("now showing the scene %s with the model %s", facts.info.name, facts.model)
+        if not loading.superseded:
+            self.answer(loading.command, problem)
+
+    def _order(self, command: Command, order: Order, succeeded: Callable[[], None] = lambda: None) -> None:
+        """Send an order to the solver, and answer the command once it has been carried out.
 
         Args:
             command: Command to answer.
-            work: Function called with the solver's parts. Returns why the command was refused, or an empty string.
-            succeeded: Function called on the presenter's thread if the work succeeds, before the command is answered.
+            order: What to do between two solutions.
+            succeeded: Function called before the command is answered, if the order was carried out.
         """
 
-        def finish(problem: str) -> None:
-            if not problem:
+        def answered(answer: Answer) -> None:
+            assert isinstance(answer, Done)
+            if not answer.problem:
+                self._presenter.adopt(self._presenter.solver.facts.settings)
                 succeeded()
-            self.answer(command, problem)
+            self.answer(command, answer.problem)
 
-        def task(parts: Any) -> bool:
-            refusals: list[str] = []
-            problem = _problem_of(command, lambda: refusals.append(work(parts)))
-            self._outcomes.put(partial(finish, problem or refusals[0]))
-            return True
-
-        self._presenter.solver.do(task)
+        self._presenter.solver.send(order, answered)
 
 
 def _problem_of(command: Command, work: Callable[[], None]) -> str:

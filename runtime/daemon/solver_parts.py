@@ -3,23 +3,42 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
-from runtime.config import ContentSettings, Settings
-from runtime.content.base import ContentSource
-from runtime.content.registry import Opener, prepare_content
-from runtime.errors import ContextLost, Stopped
-from runtime.eyes.calibration import Calibration
+from runtime.config import Settings, changed
+from runtime.content.placed import placed_source, placing_of
+from runtime.content.registry import prepare_content
+from runtime.daemon.reconfigure import Reconfiguration, ready_predictor
+from runtime.errors import ContextLost, PhasestackError
 from runtime.frame.effort import Costs, simulated_costs
-from runtime.frame.run_state import RunCell, RunState
-from runtime.frame.solver import Solver, SolverUpdate
+from runtime.frame.messages import (
+    Answer,
+    Cancel,
+    ChangeSettings,
+    Done,
+    Draw,
+    Facts,
+    Live,
+    Move,
+    Order,
+    Progress,
+    Skip,
+    SolverUpdate,
+)
+from runtime.frame.run_state import SceneCell
+from runtime.frame.solver import Solver
+from runtime.frame.targets import drawn
 from runtime.model.backends import Choice, Wanted, choose
 from runtime.model.base import trial_eyes_m
-from runtime.model.predictor import Predictor, load_predictor
+from runtime.model.buffers import LayerSlots
+from runtime.model.predictor import Predictor
 from runtime.optics.stack import PanelStack
+from runtime.plan.savings import OPTIONAL_PARTS
 from runtime.records import SolveRequest
 from runtime.support.gl import leave_context, offscreen_context
 
@@ -30,50 +49,153 @@ TRIALS = 2, 3
 log = logging.getLogger("phasestack.solver")
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, slots=True)
+class SolverSetup:
+    """Settings and measurements to start a solver with."""
+
+    settings: Settings
+    stack: PanelStack
+    simulated: bool = False  # True if the run's clock is simulated; results must then not depend on the machine's speed
+    device: Wanted | None = None  # device chosen by an earlier solver; None: as configured
+    first_number: int = 1  # number of the first solution
+    version: int = 0  # of the solver's state
+    scene: int = 1  # number of the scene
+    costs: Mapping[int, Mapping[str, float]] | None = None  # costs measured by an earlier solver; None: measure them
+    step_s: float = 10.0  # time limit for a step of a solver in its own process
+
+
 class RunningSolver:
-    """`SolverParts` for a run. Created and used on one thread."""
+    """`SolverParts` for a run."""
 
-    run: RunCell
-    solver: Solver
-    backend: Choice  # device to run the solver on, with any model
-    context: Any  # GL context, current on this thread
-    owns_context: bool  # True if `close` also releases the context
-    contexts_lost: Callable[[], int]  # returns the number of contexts lost by the panels
-    generation: int  # this solver's number within the run
-    _calibrated: tuple[Predictor, Mapping[int, Mapping[str, float]]] | None = field(init=False, default=None)
-    _owned: RunState = field(init=False)  # `close` releases this state's parts if another solver has started
+    def __init__(self, setup: SolverSetup, *, context: Any = None, slots: LayerSlots | None = None) -> None:
+        """Load the content and the model. If this fails, everything that was opened is closed.
 
-    def __post_init__(self) -> None:
-        self._owned, self._lost_before = self.run.state, self.contexts_lost()
+        Args:
+            setup: What to load.
+            context: GL context to share with the panels. None creates a new context.
+            slots: Memory shared with the presenter's process.
 
-    @property
-    def is_newest(self) -> bool:
-        """True until another solver starts. After that, this solver must not change the run."""
-        return self.run.generation == self.generation
-
-    def replace(self, **changes: Any) -> RunState:
-        """Replace parts of the run's state and return the old state, like `RunCell.replace`.
-
-        Raises Stopped if another solver has started.
+        Raises:
+            FatalError: The content or the model cannot be used.
         """
-        before = self.run.replace(self.generation, **changes)
-        self._owned = replace(before, **changes)
-        return before
-
-    @property
-    def content(self) -> ContentSource:
-        """The current content."""
-        return self.run.state.content
+        settings, stack = setup.settings, setup.stack
+        self._slots, self._owns_context = slots, context is None
+        with ExitStack() as undo:
+            opener = prepare_content(settings.content, stack)
+            if context is None:
+                context = offscreen_context()
+                undo.callback(context.release)
+            predictor = ready_predictor(settings, stack, slots=slots, warmed=setup.costs is None)
+            undo.callback(predictor.close)
+            content = opener(context=context)
+            undo.callback(content.close)
+            # On a simulated clock, `auto` always means the CPU, because any two runs must match byte for byte.
+            device = setup.device or settings.model.backend
+            device = "cpu" if setup.simulated and device == "auto" else device
+            self.backend: Choice = choose(device, predictor, lambda: context)
+            undo.callback(self.backend.backend.close)
+            predictor.set_backend(self.backend.backend)
+            undo.pop_all()
+        self.context = context
+        self.run = SceneCell(
+            settings, content=content, predictor=predictor, scene=setup.scene, first_number=setup.first_number
+        )
+        self.solver = Solver(self.run, stack, timed=not setup.simulated)
+        self._calibrated = None if setup.costs is None else (predictor, setup.costs)
+        self._change: tuple[int, Reconfiguration] | None = None
+        self._told = ""  # progress of the change, as last reported
 
     def step(self, request: SolveRequest) -> SolverUpdate:
-        if self.contexts_lost() != self._lost_before:
-            raise ContextLost("the panels have lost their OpenGL context")
-        state = self.run.state  # must be read before checking whether another solver has started
-        if not self.is_newest:
-            raise Stopped("this solver was abandoned")
-        self._owned = state
-        return self.solver.step(request, state)
+        return self.solver.step(request)
+
+    def turn(self, orders: Sequence[Order]) -> list[Answer]:
+        answers: list[Answer] = []
+        stack = self.solver.stack
+        for order in orders:
+            match order:
+                case ChangeSettings():
+                    change = Reconfiguration(
+                        order.settings, self.run.state.settings, stack,
+                        reload_content=order.reload_content, slots=self._slots,
+                    )  # fmt: skip
+                    self._change, self._told = (order.number, change), ""
+                case Cancel():
+                    if self._change is not None and self._change[0] == order.change:
+                        self._change[1].abandon()
+                case Move():
+                    answers.append(self._done(order.number, partial(self._move, order.placing)))
+                case Skip():
+                    answers.append(self._done(order.number, partial(self._skip, order.time_ns)))
+                case Draw():
+                    answers.append(
+                        drawn(order, self.run.state.content, scene=self.run.state.scene, stack=self.solver.stack)
+                    )
+        if self._change is not None:
+            number, change = self._change
+            if change.advance(self.run, self.context, self.backend.backend):
+                self._change = None
+                answers.append(Done(number, change.problem, None if change.problem else self.facts))
+            elif change.progress != self._told:
+                self._told = change.progress
+                answers.append(Progress(number, self._told))
+        return answers
+
+    @property
+    def is_changing(self) -> bool:
+        """True while a change is loading."""
+        return self._change is not None
+
+    def _done(self, number: int, work: Callable[[], str]) -> Done:
+        """Carry out an order and return its answer. If it raises an exception, the present scene stays."""
+        try:
+            problem = work()
+        except ContextLost:
+            raise
+        except PhasestackError as error:
+            problem = str(error)
+        except (Exception, SystemExit) as error:
+            log.exception("order")
+            problem = f"unexpected error ({type(error).__name__}); see the log"
+        return Done(number, problem, None if problem else self.facts)
+
+    def _move(self, placing: Mapping[str, Any]) -> str:
+        state = self.run.state
+        settings = changed(state.settings, "content", dict(placing), source="place")
+        self.run.replace(settings=settings, content=placed_source(state.content, placing_of(settings.content)))
+        return ""
+
+    def _skip(self, time_ns: int) -> str:
+        if self.run.state.content.skip(time_ns=time_ns):
+            return ""
+        return "there is no next entry because the scene is not a playlist or is already at its last entry"
+
+    @property
+    def facts(self) -> Facts:
+        state, predictor = self.run.state, self.run.state.predictor
+        return Facts(
+            state.version,
+            state.scene,
+            state.settings,
+            state.content.info,
+            predictor.name,
+            predictor.provider,
+            tuple(predictor.reductions),
+            predictor.steps,
+            predictor.refined_steps,
+            predictor.backend,
+            self.backend.why,
+            tuple(name for name in OPTIONAL_PARTS if name not in sys.modules),
+        )
+
+    def live(self, time_ns: int) -> Live:
+        content = self.run.state.content
+        return Live(
+            content.problem,
+            content.program,
+            content.describe(time_ns=time_ns),
+            self.solver.seeing,
+            self.solver.measured,
+        )
 
     def simulated_costs(self) -> Costs:
         return simulated_costs(self.run.state.settings.loop.simulated_stage_ms, self.run.state.predictor.reductions)
@@ -100,115 +222,12 @@ class RunningSolver:
         return costs
 
     def close(self) -> None:
-        state = self.run.state if self.is_newest else self._owned
-        own = [leave_context, self.context.release] if self.owns_context else []
+        if self._change is not None:
+            self._change[1].abandon()
+        state = self.run.state
+        own = [leave_context, self.context.release] if self._owns_context else []
         for release in (state.content.close, state.predictor.close, self.backend.backend.close, *own):
             try:
                 release()
             except Exception as error:  # for example because the context was lost
                 log.warning("error while closing the solver: %s", error)
-
-
-class SolverMaker:
-    """Creates a solver at startup and after each hang. Called on the new solver's thread."""
-
-    def __init__(
-        self,
-        settings: Settings,
-        stack: PanelStack,
-        calibration: Calibration,
-        *,
-        contexts_lost: Callable[[], int] = lambda: 0,
-    ) -> None:
-        """Create a factory for one run's solvers.
-
-        Args:
-            settings: Settings for the first solver. Later solvers use the run's current settings.
-            stack: The run's panels.
-            calibration: The run's calibration.
-            contexts_lost: Function that returns the number of GL contexts lost by the panels. May be called on any
-                thread.
-        """
-        self._settings, self._stack, self._calibration = settings, stack, calibration
-        self.run: RunCell | None = None  # None until the first solver exists
-        self.parts: RunningSolver | None = None  # the latest solver
-        self._device: Wanted = settings.model.backend
-        self._contexts_lost = contexts_lost
-        self._prepared: tuple[ContentSettings, Opener] | None = None  # content that was read but not yet opened
-
-    def __call__(self, *, context: Any = None, simulated: bool = False) -> RunningSolver:
-        """Create a solver with the current settings. If this fails, everything that it opened is closed.
-
-        Args:
-            context: GL context to share with the panels. None creates a new context.
-            simulated: True if the run's clock is simulated.
-
-        Raises:
-            FatalError: The content or the model cannot be used.
-        """
-        own = context is None
-        generation = self.run.begin() if self.run is not None else 0
-        settings = self.run.state.settings if self.run is not None else self._settings
-        with ExitStack() as undo:
-            opener = self._opener(settings.content)
-            if own:
-                context = offscreen_context()
-                undo.callback(context.release)
-            predictor = ready_predictor(settings, self._stack)
-            undo.callback(predictor.close)
-            self._prepared = None
-            content = opener(context=context)
-            undo.callback(content.close)
-            backend = self._chosen(predictor, context, simulated=simulated)
-            undo.callback(backend.backend.close)
-            predictor.set_backend(backend.backend)
-            if self.run is None:
-                self.run = RunCell(settings, calibration=self._calibration, content=content, predictor=predictor)
-            else:
-                self.run.replace(generation, content=content, predictor=predictor)
-            undo.pop_all()
-        parts = RunningSolver(
-            self.run,
-            Solver(self.run, self._stack, timed=not simulated),
-            backend,
-            context,
-            owns_context=own,
-            contexts_lost=self._contexts_lost,
-            generation=generation,
-        )
-        if parts.is_newest:
-            self.parts = parts
-        return parts
-
-    def _opener(self, content: ContentSettings) -> Opener:
-        """Return the content's opener. If a previous solver read this content but never opened it, reuse it."""
-        prepared = self._prepared
-        if prepared is None or prepared[0] != content:
-            prepared = self._prepared = content, prepare_content(content, self._stack)
-        return prepared[1]
-
-    def _chosen(self, predictor: Predictor, context: Any, *, simulated: bool) -> Choice:
-        """Choose the device to run the solver on. After a restart, the device stays the same.
-
-        On a simulated clock, `auto` always means the CPU, because any two runs must match byte for byte.
-        """
-        device = "cpu" if simulated and self._device == "auto" else self._device
-        choice = choose(device, predictor, lambda: context)
-        self._device = "gl" if choice.backend.name == "gl" else "cpu"
-        return choice
-
-
-def ready_predictor(settings: Settings, stack: PanelStack) -> Predictor:
-    """Load the configured model and warm it up.
-
-    Raises:
-        InputError: The model cannot be used.
-        MissingPart: A package required by the model is not installed.
-    """
-    predictor = load_predictor(settings.model.name, stack, settings.model)
-    try:
-        predictor.warm_up(trial_eyes_m(stack))
-    except BaseException:
-        predictor.close()
-        raise
-    return predictor

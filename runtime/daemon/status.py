@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from base64 import b64encode
 from dataclasses import replace
@@ -27,6 +28,7 @@ from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
 from runtime.records import U8, RefreshAccount
 from runtime.support.picture_header import VIDEOS
+from runtime.support.process import usage
 from runtime.support.version import version
 
 LIBRARY_MOST, LIBRARY_LOOKED_AT = 200, 2000  # limits: how many scenes are listed, how many folder entries are examined
@@ -40,12 +42,12 @@ def placing_in(settings: Settings) -> dict[str, Any]:
 
 def holds(presenter: Presenter) -> dict[str, Any]:
     """Return the current scene, model, placement and pause, for inclusion in answers to commands."""
-    state = presenter.run_cell.state
+    facts = presenter.solver.facts
     return {
-        "scene": state.settings.content.scene,
-        "content": state.content.info.name,
-        "model": state.predictor.name,
-        "placing": placing_in(state.settings),
+        "scene": facts.settings.content.scene,
+        "content": facts.info.name,
+        "model": facts.model,
+        "placing": placing_in(facts.settings),
         "paused": presenter.paused,
         "flat_asked": presenter.flat_asked,
     }
@@ -64,8 +66,8 @@ def shown(presenter: Presenter, account: RefreshAccount, link: BrowserLink, run:
         "eye_sigma_mm": account.eye_sigma_mm,
         "flatness": 1.0 if frame.solved is None else frame.flatness,
         "solved_for_m": None if solution is None else solution.solved_for_m,
-        "scene": presenter.run_cell.state.settings.content.scene,
-        "model": presenter.run_cell.state.settings.model.name,
+        "scene": presenter.state.settings.content.scene,
+        "model": presenter.state.settings.model.name,
         "page_ms": link.page_ms_of(account.capture_ns),
         **({} if run is None else run.observer.light(presenter.last)),
     }
@@ -74,22 +76,24 @@ def shown(presenter: Presenter, account: RefreshAccount, link: BrowserLink, run:
 def snapshot(run: Run, account: RefreshAccount) -> dict[str, Any]:
     """Return the answer to a `status` request after a given refresh."""
     presenter = run.presenter
-    machine, stats, state = presenter.machine, presenter.stats, presenter.run_cell.state
+    machine, stats = presenter.machine, presenter.stats
+    facts, live = presenter.solver.facts, presenter.solver.live
     return {
         "state": machine.name,
         "reason": machine.reason,
         "missing": presenter.missing,
         **holds(presenter),
-        "content_problem": state.content.problem,
-        "content_left_out": state.content.info.left_out,
-        "program": state.content.program,
-        "playlist": state.content.describe(time_ns=presenter.clock.now_ns()),
+        "content_problem": live.problem,
+        "content_left_out": facts.info.left_out,
+        "program": live.program,
+        "playlist": live.playlist,
         "plan": run.plan_items(),
-        "model_asked": state.settings.model.name,
-        "provider": state.predictor.provider,
-        "backend": state.predictor.backend,
-        "backend_why": run.parts.backend.why,
+        "model_asked": facts.settings.model.name,
+        "provider": facts.provider,
+        "backend": facts.backend,
+        "backend_why": facts.backend_why,
         "panels": presenter.panels.name,
+        "processes": [{"role": "presenter", "restarts": 0, **usage(os.getpid())}, *presenter.solver.status()],
         "eyes_m": account.eyes_m,
         "eyes_label": account.eyes_label,
         "eye_sigma_now_mm": account.eye_sigma_mm,
@@ -117,7 +121,7 @@ def _view_error_now_mm(account: RefreshAccount) -> float | None:
 
 def about(run: Run) -> dict[str, Any]:
     """Return a run's constant facts and the models and scenes that can be chosen, for use by the page."""
-    settings, stack = run.presenter.run_cell.state.settings, run.presenter.stack
+    settings, stack = run.presenter.state.settings, run.presenter.stack
     return {
         "version": version(),
         "stack": {"width_m": stack.width_m, "height_m": stack.height_m, "x_m": stack.x_m},
@@ -152,7 +156,7 @@ def pictures(run: Run) -> dict[str, Any]:
     refresh, state = run.presenter.last, run.presenter.machine.name
     if refresh is None:
         return {"frame": None, "jpegs": {}}
-    fov_deg = run.presenter.run_cell.state.settings.content.fov_deg
+    fov_deg = run.presenter.state.settings.content.fov_deg
     jpegs = pictures_of(refresh, run.presenter.stack, fov_deg=fov_deg)
     return {
         "frame": refresh.account.frame,

@@ -19,7 +19,6 @@ from runtime.daemon.changes import Changes
 from runtime.daemon.commands import Command
 from runtime.daemon.drive import drive
 from runtime.daemon.notify import Notifier
-from runtime.daemon.reconfigure import Reconfiguration
 from runtime.daemon.server import StatusServer, open_status_server
 from runtime.daemon.signals import Signals
 from runtime.errors import FatalError, PanelLost, Stopped, retry_advised
@@ -174,9 +173,9 @@ class Daemon(Host):
         self.recorder.save(ASKED, saved)
 
 
-def _news(loading: Reconfiguration | None, refused: str, recorder: Recorder | None) -> dict[str, Any]:
+def _news(loading: str | None, refused: str, recorder: Recorder | None) -> dict[str, Any]:
     """Return the status entries about the change being loaded, the last refusal and the black box."""
-    news: dict[str, Any] = {} if loading is None else {"loading": loading.progress}
+    news: dict[str, Any] = {} if loading is None else {"loading": loading}
     if refused:
         news["refused"] = refused
     return news | ({"blackbox": recorder.describe()} if recorder is not None else {})

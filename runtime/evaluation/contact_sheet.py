@@ -41,7 +41,7 @@ class Moment:
     asked_for: tuple[U8, ...]  # (h, w, 3) the solution's targets
     relief: F32 | None = None  # (h, w) relief of the solution's content (`optics.relief`)
     account: RefreshAccount | None = None  # the refresh
-    state_version: int = 0  # the run's state at the refresh (`RunState.version`)
+    state_version: int = 0  # the solver's state at the refresh (`Facts.version`)
 
 
 def contact_sheet(layers: U8, eye_views: EyeViews | None, *, headline: str, lines: Sequence[str] = ()) -> U8:

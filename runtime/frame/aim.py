@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from runtime.clock import NS_PER_MS, NS_PER_S
+from runtime.config import Settings
 from runtime.frame.effort import HORIZON_S, Costs, EffortChooser, Outlook, candidates, display_spread_s
-from runtime.frame.run_state import RunState
 from runtime.frame.solver_host import SolverHost
 from runtime.frame.viewer import Viewer
 from runtime.plan.savings import selected_eyes
@@ -79,7 +79,7 @@ class Aim:
         timing: FrameTiming,
         eyes: EyesEstimate,
         shown: Solution | None,
-        state: RunState,
+        settings: Settings,
         *,
         composed_ns: int,
         now_ns: int,
@@ -92,7 +92,7 @@ class Aim:
             timing: Predicted times for the current refresh.
             eyes: Eyes at the current refresh's display time.
             shown: The latest solution.
-            state: The run's state.
+            settings: The run's settings.
             composed_ns: When the current refresh was composed.
             now_ns: When the request is posted.
             flat_wanted: True if the flat picture is shown or will be needed soon.
@@ -101,23 +101,23 @@ class Aim:
         self._learn(shown, eyes)
         begins_ns = min(max(self._solver.free_ns(now_ns), now_ns), now_ns + self._period_ns)  # else replaced by then
         slots = Slots(timing.photon_ns, composed_ns, begins_ns, self._period_ns)
-        predictor, refined, costs = state.predictor, None, self._solver.costs
-        whole = self._fixed or Effort(1, predictor.steps)
+        facts, refined, costs = self._solver.facts, None, self._solver.costs
+        whole = self._fixed or Effort(1, facts.steps)
         effort, expected_m2 = whole, 0.0
-        timed = tuple(by for by in predictor.reductions if by in costs.stages)  # a new model may lack timings
-        if timed and eyes.eyes_m is not None and state.settings.model.effort == "auto":
+        timed = tuple(by for by in facts.reductions if by in costs.stages)  # a new model may lack timings
+        if timed and eyes.eyes_m is not None and settings.model.effort == "auto":
             outlook = self._outlook(slots, eyes)
             horizon_s = self._horizon_s(timing, speed_m_s=outlook(0.0).speed_m_s)
             error = self._shown_error(eyes, shown, time_ns=timing.photon_ns)
             period_ms = self._period_ns / NS_PER_MS
             if eyes.label != "held" or self._seen_effort is None or self._seen_effort.reduction not in timed:
                 self._seen_effort = self._chooser.choose(
-                    candidates(timed, predictor.steps),
+                    candidates(timed, facts.steps),
                     costs, outlook, shown_error=error, period_ms=period_ms, horizon_s=horizon_s,
                 )  # fmt: skip
             effort = self._seen_effort
             if shown is not None and eyes.label == "rested":
-                most = predictor.refined_steps
+                most = facts.refined_steps
                 refined = self._refined(shown, most, costs, shown_error=error, horizon_s=horizon_s)
             cost_ms = costs.ms(effort)
             expected_m2 = outlook(cost_ms).moved_m2(display_spread_s(cost_ms, period_ms=period_ms))

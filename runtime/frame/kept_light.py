@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
-import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol
 
 from runtime.evaluation.refresh_quality import Pictures, RefreshTargets
@@ -19,7 +20,7 @@ from runtime.support.background import MEASURING_NICENESS, BackgroundJob
 
 log = logging.getLogger("phasestack.light")
 
-LOOK_S = 0.1  # interval between checks for a stop request
+LOOK_S = 0.01  # interval between checks for drawn pictures and for a stop request
 WRITTEN_WITHIN_S = 10.0  # timeout for writing the layers of the last saved refresh
 
 
@@ -52,7 +53,7 @@ class Output(Protocol):
 class _Kept:
     account: RefreshAccount
     solved_for_ns: int
-    content: object | None  # the run's content at this refresh
+    scene: int  # the run's scene at this refresh
 
 
 class KeptLight:
@@ -87,7 +88,7 @@ class KeptLight:
         else:
             self._job = BackgroundJob("kept light", keep, niceness=MEASURING_NICENESS)
         solved_for_ns = refresh.solution.solved_for_ns if refresh.solution is not None else 0
-        kept = _Kept(account, solved_for_ns, self._drawer.shown_content())
+        kept = _Kept(account, solved_for_ns, self._drawer.scene)
         if self._truth.is_recorded:
             self._kept.append(kept)
         else:  # a live run is ended by a signal, so there is no time to draw afterwards
@@ -105,19 +106,20 @@ class KeptLight:
         total = len(self._kept)
         for done, kept in enumerate(self._kept):
             progress.tell("drawing target pictures", done, total)
-            drawn = threading.Event()
+            drawn: list[None] = []
             if not stopped():
-                self._draw(kept, drawn.set)
-            while not drawn.is_set() and not stopped():
-                drawn.wait(LOOK_S)
-            if not drawn.is_set():
+                self._draw(kept, partial(drawn.append, None))
+            while not drawn and not stopped():
+                time.sleep(LOOK_S)
+                self._drawer.look()
+            if not drawn:
                 log.warning(
                     "stopped early, so %d of %d refreshes kept by --keep-light have no target pictures",
                     total - done,
                     total,
                 )
                 for rest in self._kept[done:]:
-                    self._write(rest, RefreshTargets(self._drawer.fov_deg()))
+                    self._write(rest, RefreshTargets(self._drawer.fov_deg))
                 return
 
     def _draw(self, kept: _Kept, then: Callable[[], None]) -> None:
@@ -129,10 +131,10 @@ class KeptLight:
             wanted["true"] = true_m, account.photon_ns
 
         def write(targets: RefreshTargets | None) -> None:
-            self._write(kept, targets or RefreshTargets(self._drawer.fov_deg()))
+            self._write(kept, targets or RefreshTargets(self._drawer.fov_deg))
             then()
 
-        self._drawer.draw(wanted, kept.content, write)
+        self._drawer.draw(wanted, kept.scene, write)
 
     def _write(self, kept: _Kept, targets: RefreshTargets) -> None:
         account = kept.account

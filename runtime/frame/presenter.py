@@ -17,12 +17,14 @@ from typing import Any, Protocol
 import numpy as np
 
 from runtime.clock import NS_PER_MS, Clock, SimulatedClock, Stopwatch
+from runtime.config import Settings
 from runtime.errors import EndOfRecording, PanelLost
+from runtime.eyes.calibration import Calibration
 from runtime.frame.aim import Aim
+from runtime.frame.messages import SolverUpdate
 from runtime.frame.pacing import Pacer
 from runtime.frame.policy import Flatness, wants_flat
-from runtime.frame.run_state import RunCell
-from runtime.frame.solver import SolverUpdate
+from runtime.frame.run_state import RunState
 from runtime.frame.solver_host import SHOWN_STAGES, SolverHost
 from runtime.frame.states import Conditions, Lateness, Part, StateMachine
 from runtime.frame.stats import RunStats
@@ -71,7 +73,7 @@ class Refresh:
     account: RefreshAccount
     frame: PanelFrame
     solution: Solution | None  # the latest solution at the time of this refresh
-    state_version: int = 0  # the run's state at this refresh (`RunState.version`)
+    state_version: int = 0  # the solver's state at this refresh (`Facts.version`)
 
 
 class Observer(Protocol):
@@ -137,7 +139,7 @@ class Presenter:
 
     def __init__(
         self,
-        run: RunCell,
+        state: RunState,
         stack: PanelStack,
         *,
         clock: Clock,
@@ -154,7 +156,7 @@ class Presenter:
         """Create a presenter.
 
         Args:
-            run: Cell that holds the run's state.
+            state: The first settings and calibration.
             stack: The display's panels.
             clock: The run's clock.
             pacer: Schedules the refreshes.
@@ -168,11 +170,11 @@ class Presenter:
             fixed: Effort to use for every solution if `model.effort` is `full`. None means all steps on the full
                 raster.
         """
-        self.run_cell, self.stack, self.clock = run, stack, clock
+        self.state, self.stack, self.clock = state, stack, clock
         self.pacer, self.samples, self.viewer, self.solver, self.panels = pacer, samples, viewer, solver, panels
         self._stage_ms = stage_ms
         self._supervisor, self._observers = supervisor or Supervisor(), observers
-        self._adopted = run.state.version
+        self._adopted = state.version
         self._aim = Aim(viewer, solver, period_ns=pacer.period_ns, fixed=fixed)
         self.stats = RunStats()
         self.machine = StateMachine(now_ns=clock.now_ns())
@@ -235,7 +237,7 @@ class Presenter:
             timing,
             eyes,
             news.solution,
-            self.run_cell.state,
+            self.state.settings,
             composed_ns=composed_ns,
             now_ns=self.clock.now_ns(),
             flat_wanted=wants_flat(eyes, flat_asked=self.flat_asked, flatness=self._flatness.value),
@@ -250,10 +252,15 @@ class Presenter:
 
     def _adopt_settings(self) -> None:
         """Adopt any settings changed since the last refresh."""
-        state = self.run_cell.state
+        state = self.state
         if state.version != self._adopted:
             self._adopted = state.version
             self.viewer.adopt(state.settings, state.calibration)
+
+    def adopt(self, settings: Settings, calibration: Calibration | None = None) -> None:
+        """Use other settings, and perhaps another calibration, from the next refresh on."""
+        state = self.state
+        self.state = RunState(state.version + 1, settings, calibration or state.calibration)
 
     def _receive(self, now_ns: int) -> None:
         for sample in self.samples.arrived(now_ns):
@@ -299,7 +306,7 @@ class Presenter:
         If no eyes are known, the same solution's previous alignment is returned. If the layers are shown as solved, the
         alignment contains no matrices.
         """
-        plan = self.run_cell.state.settings.plan
+        plan = self.state.settings.plan
         if solution is None or solution.solved_for_m is None or not plan.align:
             return Alignment(())
         last = self._aligned
@@ -406,7 +413,7 @@ class Presenter:
     def _report(
         self, account: RefreshAccount, frame: PanelFrame, solution: Solution | None, times: RefreshTimes
     ) -> None:
-        self.last = Refresh(account, frame, solution, self._adopted)
+        self.last = Refresh(account, frame, solution, self.solver.facts.version)
         self._supervisor.refreshed(self, account)
         self.stats.add(account, overhead_ms=times.overhead_ms(), missed_blanks=self.pacer.missed)
         for observer in self._observers:
@@ -418,11 +425,11 @@ class Presenter:
         Args:
             simulated: True if the run's clock is simulated.
         """
-        predictor = self.run_cell.state.predictor
+        facts = self.solver.facts
         return {
             **self.stats.summary(stale_inputs=self.samples.stale_inputs, simulated=simulated),
-            "model": predictor.name,
-            "provider": predictor.provider,
+            "model": facts.model,
+            "provider": facts.provider,
             "states": self.machine.seconds(now_ns=self.clock.now_ns()),
         }
 

@@ -1,6 +1,6 @@
 """Measure the quality of a sample of refreshes, each once its true eyes are known.
 
-The target pictures are drawn on the solver's thread. In real time, a background thread compares them with one refresh's
+The solver draws the target pictures. In real time, a background thread compares them with one refresh's
 layers at a time, starting with the newest refresh. It works during only a small share of the run, because measuring
 must not slow down the solutions being measured. If refreshes come due while a measurement is running, a few of them are
 queued and measured after the run, and the others are dropped. On a simulated clock, every refresh that is due is
@@ -14,7 +14,6 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from queue import Empty, SimpleQueue
 from typing import Any
 
 import numpy as np
@@ -44,7 +43,7 @@ REST_S = 0.3  # how long the eyes must rest before a live page's refresh is meas
 @dataclass(frozen=True, slots=True)
 class _Sample:
     refresh: Refresh
-    content: object | None  # the run's content at this refresh
+    scene: int  # the run's scene at this refresh
 
 
 class QualitySampler:
@@ -92,7 +91,7 @@ class QualitySampler:
         if not is_sample or not refresh.account.presented:
             return
         self._samples += 1
-        self._waiting.append(_Sample(refresh, self._drawer.shown_content()))
+        self._waiting.append(_Sample(refresh, self._drawer.scene))
         while not self._simulated and len(self._waiting) > 1 and self._holds_too_much():
             del self._waiting[self._samples % (len(self._waiting) - 1)]
 
@@ -110,7 +109,7 @@ class QualitySampler:
         if self._tried is None or not _is_alike(self._tried, refresh):
             self._resumes_s = 0.0
         if now_s - self._rests_since_s >= REST_S:
-            self._waiting.append(_Sample(refresh, self._drawer.shown_content()))
+            self._waiting.append(_Sample(refresh, self._drawer.scene))
 
     def _holds_too_much(self) -> bool:
         layers = [sample.refresh.solution.layers for sample in self._waiting if sample.refresh.solution is not None]
@@ -129,6 +128,7 @@ class QualitySampler:
         ends_s = time.monotonic() + MEASURED_WITHIN_S
         self._collect()
         while self._is_busy and not stopped() and time.monotonic() < ends_s:
+            self._drawer.look()
             self.advance(at_once=True)
             if self._is_busy:
                 time.sleep(LOOK_S)
@@ -167,14 +167,16 @@ class QualitySampler:
 
         The result counts towards the means only if no other refresh has been measured.
         """
-        queue: SimpleQueue[RefreshTargets | None] = SimpleQueue()
+        drawn: list[RefreshTargets | None] = []
         true_m = self._truth.at(last.account.photon_ns)
-        self._drawer.draw(self._wanted(last, true_m), None, queue.put)
-        try:
-            targets = queue.get(timeout=0.0 if self._simulated else DRAWN_WITHIN_S)
-        except Empty:
+        self._drawer.draw(self._wanted(last, true_m), None, drawn.append)
+        ends_s = time.monotonic() + DRAWN_WITHIN_S
+        while not drawn and not self._simulated and time.monotonic() < ends_s:
+            time.sleep(LOOK_S)
+            self._drawer.look()
+        if not drawn:
             return
-        quality = self._compared(last, true_m, targets)
+        quality = self._compared(last, true_m, drawn[0])
         counts = not self.measured and last.account.state is State.TRACKING
         self._take(last.account.frame, quality, figures=counts, live=not self.live)
 
@@ -197,7 +199,7 @@ class QualitySampler:
             self._drawing = False
 
         self._drawing = True
-        self._drawer.draw(wanted, sample.content, compare)
+        self._drawer.draw(wanted, sample.scene, compare)
 
     def _wanted(self, refresh: Refresh, true_m: F64 | None) -> dict[str, tuple[F64, int]]:
         """Return the eyes (2, 3) and the time to draw each target for, keyed by field of `RefreshTargets`."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from time import perf_counter_ns
 
 import numpy as np
@@ -11,9 +11,10 @@ import numpy as np
 from runtime.clock import NS_PER_MS, Stopwatch
 from runtime.content.base import View
 from runtime.errors import ContentFailure, ContextLost, ModelFailure
+from runtime.frame.messages import SolverUpdate
 from runtime.frame.meter import SolutionMeter
 from runtime.frame.policy import FramePolicy, SolutionKey
-from runtime.frame.run_state import RunCell, RunState
+from runtime.frame.run_state import SceneCell, SceneState
 from runtime.model.geometry import TargetView
 from runtime.model.job import Job, SolveWindow
 from runtime.model.targets import flat_layers
@@ -21,7 +22,7 @@ from runtime.optics.stack import PanelStack
 from runtime.optics.views import raster_from_stack
 from runtime.plan.drawing import drawn_job
 from runtime.plan.savings import Measured, Plan, make_plan, seeing_eyes
-from runtime.records import F64, U8, Effort, PlanItem, Solution, SolveRequest
+from runtime.records import F64, U8, Effort, Solution, SolveRequest
 from runtime.support.gl import DrawnPicture
 
 log = logging.getLogger("phasestack.solver")
@@ -29,26 +30,17 @@ log = logging.getLogger("phasestack.solver")
 FLAT_EYE_M = (0.7, 0.0, 0.0)  # the flat picture's viewpoint until a viewer has been seen
 
 
-@dataclass(frozen=True, slots=True)
-class SolverUpdate:
-    """The results of one request or, in `SolverHost.news`, the latest results of all requests."""
-
-    solution: Solution | None = None  # a new solution for two eyes
-    flat: Solution | None = None  # a new flat picture
-    missing: dict[str, str] = field(default_factory=dict)  # reason for each failed part (content, model)
-
-
 class Solver:
     """Computes at most one solution or flat picture in each step.
 
-    Each step uses the run's state as it was when the step began.
+    Each step uses the state as it was when the step began.
     """
 
-    def __init__(self, run: RunCell, stack: PanelStack, *, timed: bool = True) -> None:
-        """Create a solver for a run.
+    def __init__(self, run: SceneCell, stack: PanelStack, *, timed: bool = True) -> None:
+        """Create a solver.
 
         Args:
-            run: Cell that holds the run's state.
+            run: Cell that holds the solver's state.
             stack: The display's panels.
             timed: True to apply `model.budget_ms`. False on a simulated clock, because results must then not depend on
                 the machine's speed.
@@ -67,14 +59,14 @@ class Solver:
         self._middle_m: F64 = np.array(FLAT_EYE_M)
         self._missing: dict[str, str] = {}
 
-    def step(self, request: SolveRequest, state: RunState | None = None) -> SolverUpdate:
+    def step(self, request: SolveRequest, state: SceneState | None = None) -> SolverUpdate:
         """Carry out a request and return the results.
 
         If the content or the model fails, the update names the failed part, and all earlier results remain valid.
 
         Args:
             request: The request to carry out.
-            state: The run's state to use for drawing and solving. None means the latest state.
+            state: The state to use for drawing and solving. None means the latest state.
 
         Raises:
             ContextLost: The GL context was lost, so this solver can no longer be used.
@@ -132,7 +124,7 @@ class Solver:
         return watch.stage_ms
 
     def _solve(
-        self, state: RunState, request: SolveRequest, eyes_m: F64, effort: Effort, *, revision: int
+        self, state: SceneState, request: SolveRequest, eyes_m: F64, effort: Effort, *, revision: int
     ) -> SolverUpdate:
         settings, watch = state.settings.model, Stopwatch()
         sigma_m = request.sigma_m if settings.eye_sigma_mm == "auto" else settings.eye_sigma_mm / 1e3
@@ -178,7 +170,7 @@ class Solver:
         )
         return SolverUpdate(solution=solution)
 
-    def _drawn(self, state: RunState, request: SolveRequest, eyes_m: F64, reduction: int) -> Job:
+    def _drawn(self, state: SceneState, request: SolveRequest, eyes_m: F64, reduction: int) -> Job:
         """Draw a solution's target pictures.
 
         If the head is at rest, the pictures are also copied, because the solution may be refined later.
@@ -199,7 +191,7 @@ class Solver:
             job = self._kept = replace(job, targets=replace(job.targets, views=(left, right)))
         return job
 
-    def _draw_flat(self, state: RunState, *, revision: int, time_ns: int) -> SolverUpdate:
+    def _draw_flat(self, state: SceneState, *, revision: int, time_ns: int) -> SolverUpdate:
         watch = Stopwatch()
         failed = False
         try:
@@ -220,18 +212,12 @@ class Solver:
         flat = Solution(self.run.next_number(), layers, None, time_ns, stage_ms=watch.stage_ms)
         return SolverUpdate(flat=flat, missing=dict(self._missing))  # the model's fault is not over
 
-    def plan_items(self, measured: Measured | None = None) -> tuple[PlanItem, ...]:
-        """Return the savings applied by the plan, with the times and errors measured for them.
+    @property
+    def seeing(self) -> tuple[bool, bool]:
+        """For the left and the right eye, True if the eye can see the display."""
+        return self._seeing
 
-        Thread-safe.
-
-        Args:
-            measured: Times and errors to report. None means those measured by this solver.
-        """
-        state = self.run.state
-        return self._plan_of(state, self._seeing, measured or self.measured).items
-
-    def _replan(self, state: RunState, eyes_m: F64 | None) -> None:
+    def _replan(self, state: SceneState, eyes_m: F64 | None) -> None:
         """Update the plan if the run's state or the set of eyes that can see the display has changed."""
         seeing = self._seeing if eyes_m is None else seeing_eyes(eyes_m, self._seeing)
         self._seeing = seeing
@@ -241,7 +227,7 @@ class Solver:
             self.plan = self._plan_of(state, seeing, self.measured)
 
     @staticmethod
-    def _plan_of(state: RunState, seeing: tuple[bool, bool], measured: Measured) -> Plan:
+    def _plan_of(state: SceneState, seeing: tuple[bool, bool], measured: Measured) -> Plan:
         return make_plan(state.content.info, state.settings, seeing=seeing, measured=measured)
 
     def _failed(self, part: str, error: BaseException, *, expected: type[Exception]) -> dict[str, str]:

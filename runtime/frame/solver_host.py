@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Protocol
+from typing import Any, Protocol
 
 from runtime.clock import NS_PER_MS, Clock
 from runtime.frame.effort import Costs
-from runtime.frame.solver import SolverUpdate
+from runtime.frame.messages import Answer, Facts, Live, Order, Progress, SolverUpdate
 from runtime.records import SolveRequest
 
 
@@ -22,10 +22,20 @@ SHOWN_STAGES = ("render", "prepare", "inference", "finish")  # in frames.jsonl, 
 
 
 class SolverParts(Protocol):
-    """A solver and its thread's resources, such as a GL context."""
+    """A solver with its scene, its model and its GL context. For use on one thread."""
 
     def step(self, request: SolveRequest) -> SolverUpdate:
         """Carry out one request and return its results."""
+
+    def turn(self, orders: Sequence[Order]) -> list[Answer]:
+        """Carry out orders between two steps, and return the answers that are ready."""
+
+    @property
+    def facts(self) -> Facts:
+        """Scene, model and device in use."""
+
+    def live(self, time_ns: int) -> Live:
+        """Return what changes by itself."""
 
     def simulated_costs(self) -> Costs:
         """Return the solution costs that apply on a simulated clock with the current settings."""
@@ -34,29 +44,43 @@ class SolverParts(Protocol):
         """Return the times of solutions in milliseconds, keyed by reduction and then stage.
 
         They are measured at the first call and whenever the model has changed, with the content as it is at `time_ns`.
-        Called on the solver's thread.
         """
 
     def close(self) -> None:
-        """Release all resources not in use by a newer solver.
-
-        Called on the thread that created the solver.
-        """
+        """Release all resources."""
 
 
-Task = Callable[[SolverParts], bool]  # called between steps on the solver's thread until it returns True
+Then = Callable[[Answer], None]
 
 
 class SolverHost(ABC):
     """Base class for hosts, which run a solver on the presenter's behalf.
 
-    The presenter posts requests and reads results. Neither operation waits for the solver.
+    For use on the presenter's thread.
+
+    The presenter posts requests, sends orders and reads results. None of these waits for the solver.
     """
+
+    restarts = 0  # how many solvers have been replaced
+
+    def __init__(self) -> None:
+        self._sent = 0
+        self._waiting: dict[int, Then] = {}  # orders without a last answer
 
     @property
     @abstractmethod
     def costs(self) -> Costs:
         """Current solution costs."""
+
+    @property
+    @abstractmethod
+    def facts(self) -> Facts:
+        """Scene, model and device in use."""
+
+    @property
+    @abstractmethod
+    def live(self) -> Live:
+        """Values that change by themselves."""
 
     @abstractmethod
     def free_ns(self, now_ns: int) -> int:
@@ -68,15 +92,47 @@ class SolverHost(ABC):
 
     @abstractmethod
     def news(self) -> SolverUpdate:
-        """Return the latest complete solution and flat picture, and the parts that have failed."""
+        """Return the latest complete solution and flat picture, and the parts that have failed.
 
-    @abstractmethod
-    def do(self, task: Task) -> None:
-        """Run a task between solver steps, again and again until it returns True."""
+        Before it returns, it passes on all answers that have arrived.
+        """
+
+    def send(self, order: Order, then: Then = lambda answer: None) -> int:
+        """Send an order and return its number.
+
+        Args:
+            order: Order without a number.
+            then: Function called with each answer, on this thread, by `news`.
+        """
+        self._sent += 1
+        self._waiting[self._sent] = then
+        self._dispatch(replace(order, number=self._sent))
+        return self._sent
+
+    def restart(self, reason: str) -> None:  # noqa: B027 - a solver in this process cannot be ended
+        """Replace the solver, if it runs in its own process.
+
+        Args:
+            reason: What to report, such as `was ended because it took too long`.
+        """
+
+    def status(self) -> list[dict[str, Any]]:
+        """Return what the solver's process uses, for the status. Empty if it is this process."""
+        return []
 
     @abstractmethod
     def close(self) -> None:
         """Stop the solver and release its resources. May be called more than once."""
+
+    @abstractmethod
+    def _dispatch(self, order: Order) -> None:
+        """Pass an order on to the solver."""
+
+    def _answered(self, answer: Answer) -> None:
+        waiting = self._waiting
+        then = waiting.get(answer.number) if isinstance(answer, Progress) else waiting.pop(answer.number, None)
+        if then is not None:
+            then(answer)
 
 
 def taken_in(news: SolverUpdate, step: SolverUpdate) -> SolverUpdate:
@@ -92,17 +148,17 @@ class SimulatedSolver(SolverHost):
     """
 
     def __init__(self, parts: SolverParts, clock: Clock) -> None:
-        self._parts, self._clock = parts, clock
+        super().__init__()
+        self.parts, self._clock = parts, clock
         self._news = taken_in(SolverUpdate(), parts.step(first_request(clock.now_ns())))
         self._posted: tuple[int, SolveRequest] | None = None
         self._under_way: tuple[int, SolverUpdate] | None = None  # completion time in ns, and result
         self._idle_since_ns = clock.now_ns()
-        self._tasks: list[Task] = []
         self._closed = False
 
     @property
     def costs(self) -> Costs:
-        return self._parts.simulated_costs()
+        return self.parts.simulated_costs()
 
     def free_ns(self, now_ns: int) -> int:
         self._advance()
@@ -117,17 +173,32 @@ class SimulatedSolver(SolverHost):
         self._advance()
         return self._news
 
-    def do(self, task: Task) -> None:
-        if not task(self._parts):
-            self._tasks.append(task)
+    @property
+    def facts(self) -> Facts:
+        return self.parts.facts
+
+    @property
+    def live(self) -> Live:
+        return self.parts.live(self._clock.now_ns())
+
+    def _dispatch(self, order: Order) -> None:
+        self._turn(order)
 
     def close(self) -> None:
         if not self._closed:
             self._closed = True
-            self._parts.close()
+            self.parts.close()
+
+    def look(self) -> None:
+        """Pass on answers to orders that take real time, such as loading."""
+        self._turn()
+
+    def _turn(self, *orders: Order) -> None:
+        for answer in self.parts.turn(orders):
+            self._answered(answer)
 
     def _advance(self) -> None:
-        """Publish results, run tasks and start requests, in order, up to the current time."""
+        """Publish results, carry out orders and start requests, in order, up to the current time."""
         now_ns = self._clock.now_ns()
         while True:
             if self._under_way is not None:
@@ -136,12 +207,12 @@ class SimulatedSolver(SolverHost):
                     return
                 self._news = taken_in(self._news, step)
                 self._under_way, self._idle_since_ns = None, done_ns
-            self._tasks = [task for task in self._tasks if not task(self._parts)]
+            self._turn()
             if self._posted is None:
                 return
             (posted_ns, request), self._posted = self._posted, None
             begun_ns = max(posted_ns, self._idle_since_ns)
-            step, cost_ns = self._timed(self._parts.step(request))
+            step, cost_ns = self._timed(self.parts.step(request))
             self._under_way = begun_ns + cost_ns, step
 
     def _timed(self, step: SolverUpdate) -> tuple[SolverUpdate, int]:

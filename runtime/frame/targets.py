@@ -1,69 +1,72 @@
-"""Draw target pictures for given eyes on the solver's thread, in the solver's GL context."""
+"""Target pictures at given eyes: asked for by the presenter, and drawn by the solver."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
-from typing import Any
 
+from runtime.content.base import ContentSource
 from runtime.errors import ContentFailure
 from runtime.evaluation.refresh_quality import RefreshTargets
+from runtime.frame.messages import Answer, Draw, Drawn, Wanted
 from runtime.frame.solver_host import SolverHost
 from runtime.optics.stack import PanelStack
 from runtime.plan.drawing import retina_pictures
-from runtime.records import F64
-
-Wanted = Mapping[str, tuple[F64, int]]  # eyes (2, 3) in frame `stack` and a time, keyed by field of `RefreshTargets`
 
 
 class TargetDrawer:
-    """Draws target pictures between solver steps."""
+    """Has target pictures drawn between solver steps. For use on the presenter's thread."""
 
-    def __init__(
-        self,
-        solver: SolverHost,
-        stack: PanelStack,
-        *,
-        fov_deg: Callable[[], float],
-        shown_content: Callable[[], object | None] = lambda: None,
-    ) -> None:
-        """Create a target drawer.
+    def __init__(self, solver: SolverHost) -> None:
+        """Create a target drawer that asks a solver."""
+        self._solver = solver
 
-        Args:
-            solver: Host of the solver whose thread draws the pictures.
-            stack: The display's panels.
-            fov_deg: Function that returns the target pictures' current field of view, which a reload may change.
-            shown_content: Function that returns the run's current content, or None if the content is never replaced.
-        """
-        self._solver, self._stack, self.fov_deg = solver, stack, fov_deg
-        self.shown_content = shown_content
+    @property
+    def fov_deg(self) -> float:
+        """The target pictures' current field of view, which a reload may change."""
+        return self._solver.facts.settings.content.fov_deg
 
-    def draw(self, wanted: Wanted, content: object | None, then: Callable[[RefreshTargets | None], None]) -> None:
-        """Draw the wanted pictures on the solver's thread, and pass them to `then`.
+    @property
+    def scene(self) -> int:
+        """The current scene's number, which changes when it is replaced or moved."""
+        return self._solver.facts.scene
+
+    def draw(self, wanted: Wanted, scene: int | None, then: Callable[[RefreshTargets | None], None]) -> None:
+        """Have the wanted pictures drawn, and pass them to `then`.
 
         Args:
             wanted: Eyes and time to draw each pair of pictures for, keyed by field of `RefreshTargets`.
-            content: The run's content at the refresh to draw for. None means the current content.
-            then: Function called with the pictures on the solver's thread, or with None if `content` has been replaced
-                or drawing has failed. In the latter case, the run's state gives the reason.
+            scene: The current scene's number at the refresh to draw for. None means the present scene.
+            then: Function called with the pictures on the presenter's thread, or with None if the scene has been
+                replaced or drawing has failed. In the latter case, the run's state gives the reason.
         """
 
-        def task(parts: Any) -> bool:
-            targets = None
-            try:
-                with suppress(ContentFailure):
-                    if content is None or parts.content is content:
-                        targets = self._drawn(parts.content, wanted)
-            finally:
-                then(targets)
-            return True
+        def answered(answer: Answer) -> None:
+            assert isinstance(answer, Drawn)
+            then(answer.targets)
 
-        self._solver.do(task)
+        self._solver.send(Draw(wanted, scene, self.fov_deg), answered)
 
-    def _drawn(self, content: Any, wanted: Wanted) -> RefreshTargets:
-        fov_deg = self.fov_deg()
+    def look(self) -> None:
+        """Pass on pictures that have been drawn. Only needed while there are no refreshes."""
+        self._solver.news()
+
+
+def drawn(order: Draw, content: ContentSource, *, scene: int, stack: PanelStack) -> Drawn:
+    """Draw target pictures, on the solver's thread.
+
+    Args:
+        order: Which pictures to draw.
+        content: The current scene.
+        scene: The current scene's number. If the order names another one, nothing is drawn.
+        stack: The run's panels.
+    """
+    if order.scene not in (None, scene):
+        return Drawn(order.number, None)
+    with suppress(ContentFailure):
         pictures = {
-            name: retina_pictures(content, eyes_m, self._stack, fov_deg=fov_deg, time_ns=time_ns)
-            for name, (eyes_m, time_ns) in wanted.items()
+            name: retina_pictures(content, eyes_m, stack, fov_deg=order.fov_deg, time_ns=time_ns)
+            for name, (eyes_m, time_ns) in order.wanted.items()
         }
-        return RefreshTargets(fov_deg, **pictures)
+        return Drawn(order.number, RefreshTargets(order.fov_deg, **pictures))
+    return Drawn(order.number, None)

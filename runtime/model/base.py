@@ -16,6 +16,7 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
 
 if TYPE_CHECKING:
+    from runtime.model.buffers import LayerSlots
     from runtime.model.device import SolverBackend
 
 
@@ -78,6 +79,9 @@ class Predictor(ABC):
 
         May only be called by the thread that solves.
         """
+
+    def write_to(self, slots: LayerSlots) -> None:  # noqa: B027 - the layers of the others are copied
+        """Write solutions to memory shared with another process, if the model can."""
 
     @abstractmethod
     def solve(self, job: Job, watch: Stopwatch | None = None) -> Prediction:

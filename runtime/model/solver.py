@@ -11,7 +11,7 @@ from time import perf_counter_ns
 
 from runtime.clock import Stopwatch
 from runtime.model.base import STAGES, Prediction, Predictor
-from runtime.model.buffers import LayerBuffer, LayerPool
+from runtime.model.buffers import LayerBuffer, LayerPool, LayerSlots
 from runtime.model.contract import Places, Step
 from runtime.model.cpu import CpuBackend
 from runtime.model.device import SolverBackend, SolverState
@@ -74,6 +74,7 @@ class StepPredictor(Predictor):
         self.refined_steps = max(self.steps, REFINED_STEPS)
         self._backend: SolverBackend = backend or CpuBackend()
         self._rasters: dict[PanelStack, tuple[SolverState, LayerPool]] = {}
+        self._slots: LayerSlots | None = None
         # The newest solution's geometry, channels and number of steps; the state still holds its panels.
         self._improved: tuple[Geometry, int, int] | None = None
 
@@ -98,11 +99,15 @@ class StepPredictor(Predictor):
         self.close()
         self._backend = backend
 
+    def write_to(self, slots: LayerSlots) -> None:
+        self.close()
+        self._slots = slots
+
     def solve(self, job: Job, watch: Stopwatch | None = None) -> Prediction:
         watch = watch or Stopwatch(*STAGES)
         if job.stack not in self._rasters:
             state = self._backend.state(job.stack, threads=self._threads)
-            self._rasters[job.stack] = state, LayerPool(job.stack)
+            self._rasters[job.stack] = state, LayerPool(job.stack, self._slots)
         state, pool = self._rasters[job.stack]
         buffer, rest, window = pool.take(), rest_code(job.stack.count), job.window
         done: _Done = 0, None

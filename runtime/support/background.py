@@ -17,7 +17,6 @@ log = logging.getLogger("phasestack.background")
 
 PRESENTER_NICENESS = -10  # used if realtime priority is not allowed
 REALTIME_PRIORITY = 1  # lowest realtime priority, which still takes precedence over every ordinary thread
-SOLVER_NICENESS = 5
 BACKGROUND_NICENESS = 10
 MEASURING_NICENESS = 15  # for measurements and file output, which are not urgent
 # Time limit for waits after a stop request. The rest of the two seconds is left for calls without a timeout.
@@ -26,7 +25,6 @@ T = TypeVar("T")
 
 _ends_by_s = math.inf
 _running: set[threading.Thread] = set()
-_abandoned: set[threading.Thread] = set()
 
 
 def ends_by(at_s: float) -> None:
@@ -56,25 +54,6 @@ def begin(name: str, run: Callable[..., None], *args: Any) -> threading.Thread:
     except RuntimeError as error:
         raise TransientError(f"{name}: {error}") from error
     return thread
-
-
-class ThreadAbandoned(BaseException):
-    """Raised on a thread that was abandoned because its result is no longer needed."""
-
-
-def abandon(thread: threading.Thread) -> None:
-    """Mark a thread as abandoned. From then on, `raise_if_abandoned` raises on that thread."""
-    _abandoned.add(thread)
-
-
-def raise_if_abandoned() -> None:
-    """Raise ThreadAbandoned if the calling thread has been abandoned.
-
-    Background work calls this function between operations such as drawing. An asynchronous exception is not an
-    alternative, because it could arrive during a call to moderngl, which would then crash.
-    """
-    if _abandoned and threading.current_thread() in _abandoned:
-        raise ThreadAbandoned
 
 
 class BackgroundJob(Generic[T]):

@@ -1,4 +1,7 @@
-"""Send messages between two processes of one run. Large arrays are passed in shared memory, not through the socket."""
+"""Send messages between two processes of one run.
+
+Large arrays are passed in shared memory, not through the socket.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,9 @@ class ChannelClosed(Exception):
 
 
 class Channel:
-    """One end of a two-way channel. Messages are any picklable values, and arrive whole, in order, or not at all.
+    """One end of a two-way channel.
+
+    Messages are any picklable values, and arrive whole, in order, or not at all.
 
     Both processes are trusted, because a message is unpickled. Each end may be used by only one thread at a time.
     """
@@ -124,7 +129,9 @@ class Channel:
 
 
 def shared_memory(name: str, size: int) -> int:
-    """Return the file descriptor of new shared memory, all zeros. Memory is used only for what is written.
+    """Return the file descriptor of new shared memory, all zeros.
+
+    Memory is used only for what is written.
 
     Raises OSError if the system has none.
     """

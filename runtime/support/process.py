@@ -1,4 +1,4 @@
-"""Run a part of the program in a separate process, which is watched, killed if it hangs, and started again.
+"""Run a part of the program in a process that is watched, killed if it hangs, and restarted.
 
 `Worker` is the parent's side, `Parent` the worker's. A worker is a fresh interpreter that ends with its parent. It says
 how long its next work may take (`Parent.allow`). If it takes longer, needs too much memory or crashes, it is killed
@@ -199,7 +199,7 @@ class Worker:
             return False
 
     def receive(self) -> list[Any]:
-        """Return all messages that have arrived, with `Began` and `Ended` where a process has begun and ended."""
+        """Return all messages that have arrived, and `Began` and `Ended` for each process."""
         messages: list[Any] = []
         while self._lives:
             life = self._lives[0]
@@ -269,11 +269,11 @@ class Worker:
                 life.close()
                 self._ready.set()
                 return
+            life.ended = reason
             self.restarts += 1
             self._report(life, reason)
             was_well = life.ready_s is not None and time.monotonic() - life.ready_s > WELL_S
             delay_s = 0.0 if was_well else min(max(AGAIN_S, 2 * delay_s), AGAIN_MAX_S)
-            life.ended = reason  # last, because the process counts as running until then
             life.close()
 
     def _watch(self, life: _Life) -> None:
@@ -392,7 +392,10 @@ class Parent:
         self._words[READY] = 1
 
     def receive(self, timeout_s: float = 0.0) -> list[Any]:
-        """Return all messages that have arrived, oldest first, or wait for one. Raises ChannelClosed at the end."""
+        """Return all messages that have arrived, oldest first, or wait for one.
+
+        Raises ChannelClosed at the end.
+        """
         return self._channel.receive(timeout_s)
 
     def send(self, message: Any) -> None:

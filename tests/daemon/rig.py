@@ -12,12 +12,14 @@ from unittest.mock import patch
 import numpy as np
 
 from runtime.config import SensorSettings, Settings
-from runtime.daemon.build import Host, Run, RunOptions, build_run
+from runtime.daemon.build import Host, Run, RunOptions, build_run, start_solver
+from runtime.daemon.solver_parts import RunningSolver, SolverSetup
 from runtime.errors import PanelLost
 from runtime.frame.presenter import Presenter
 from runtime.records import EyePoints, PanelFrame, PresentReport, RefreshAccount, SensorFrame, State
 from runtime.sensor.base import Capabilities, Sensor
 from runtime.sensor.registry import open_sensor
+from tests.daemon.inline import ThreadSolver
 
 SMALL: dict[str, Any] = {
     "stack": {"width_px": 192, "height_px": 108},
@@ -89,13 +91,12 @@ class Rig:
         host: Any = None,
         recorder: Any = None,
         late_s: float = 5.0,  # tolerate a busy machine
-        abandon_s: float = 60.0,
+        in_process: bool = False,  # True to run the solver in a process, as it does outside of tests
         open_timeout_s: float = 0.3,
         **changes: dict[str, Any],
     ) -> None:
         self._times = QUICK | {
-            "frame.solver_thread.LATE_S": late_s,
-            "frame.solver_thread.ABANDON_S": abandon_s,
+            "frame.solver_process.LATE_S": late_s,
             "sensor.worker.OPEN_TIMEOUT_S": open_timeout_s,
         }
         self.plan = Plan()
@@ -103,6 +104,7 @@ class Rig:
         self.settings = Settings.model_validate(tables)
         self.host = host or Host()
         self.host.recorder = recorder or self.host.recorder
+        self._in_process = in_process
         self._cleanup = ExitStack()
         self.accounts: list[RefreshAccount] = []
 
@@ -111,14 +113,20 @@ class Rig:
             for name, seconds in self._times.items():
                 self._cleanup.enter_context(patch(f"runtime.{name}", seconds))
             self._cleanup.enter_context(patch("runtime.daemon.build.open_sensor", self._opened))
+            self._cleanup.enter_context(patch("runtime.daemon.build.start_solver", self._solver_of))
             self.run: Run = build_run(
                 self.settings, RunOptions(), self._cleanup, self.host, on_account=self.accounts.append
             )
         except BaseException:
             self._cleanup.close()
             raise
-        self._well = self.presenter.panels, self.predictor
+        self._well = self.presenter.panels, None if self._in_process else self.predictor
         return self
+
+    def _solver_of(self, settings: Settings, stack: Any, clock: Any, **how: Any) -> Any:
+        if self._in_process:
+            return start_solver(settings, stack, clock, **how)
+        return ThreadSolver(SolverSetup(settings, stack), clock)
 
     def _opened(self, settings: SensorSettings, clock: Any, **how: Any) -> Sensor:
         return FragileDriver(self.plan, clock) if settings.driver == "fragile" else open_sensor(settings, clock, **how)
@@ -127,7 +135,8 @@ class Rig:
         """Restore everything that was broken to its initial state."""
         self.plan.mend()
         self.presenter.panels, predictor = self._well
-        self.presenter.run_cell.replace(predictor=predictor)
+        if predictor is not None:
+            self.parts.run.replace(predictor=predictor)
 
     def __exit__(self, *exception: object) -> None:
         self.plan.released.set()
@@ -138,14 +147,21 @@ class Rig:
         return self.run.presenter
 
     @property
+    def parts(self) -> RunningSolver:
+        """The solver, unless it runs in a process."""
+        solver = self.presenter.solver
+        assert isinstance(solver, ThreadSolver)
+        return solver.parts
+
+    @property
     def content(self) -> Any:
         """Content currently drawn."""
-        return self.presenter.run_cell.state.content
+        return self.parts.run.state.content
 
     @property
     def predictor(self) -> Any:
         """Predictor currently in use."""
-        return self.presenter.run_cell.state.predictor
+        return self.parts.run.state.predictor
 
     def refresh_until(self, wanted: str | Callable[[], Any], *, within_s: float = 90.0) -> RefreshAccount:
         """Refreshes until the state is called this, or until it holds. Raises AssertionError where it never does."""
@@ -170,12 +186,13 @@ class Rig:
         """
         done = threading.Event()
 
-        def between(parts: Any) -> bool:
+        def between() -> None:
             work()
             done.set()
-            return True
 
-        self.presenter.solver.do(between)
+        solver = self.presenter.solver
+        assert isinstance(solver, ThreadSolver)
+        solver.between_steps(between)
         self.refresh_until(done.is_set)
         self.presenter.refresh()
 
@@ -198,7 +215,7 @@ class Rig:
     def break_predictor(self) -> BreakablePredictor:
         """The model, from now on in the hands of the test."""
         predictor = BreakablePredictor(self.predictor)
-        self.presenter.run_cell.replace(predictor=predictor)
+        self.parts.run.replace(predictor=predictor)
         return predictor
 
 

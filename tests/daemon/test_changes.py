@@ -5,7 +5,6 @@ No change loses a refresh: the presenter keeps showing the existing solution.
 
 from __future__ import annotations
 
-import importlib
 import sys
 import threading
 import time
@@ -30,7 +29,6 @@ from runtime.daemon.signals import Signals
 from runtime.daemon.supervise import Daemon
 from runtime.support import progress
 from runtime.support.logs import TextFormat
-from runtime.support.untrusted_input import LIMITS
 from tests.daemon.rig import SMALL, TRACKING, Rig
 
 STEADY: dict[str, Any] = {"sensor": {"timeout_s": 5.0}, "tracker": {"hold_s": 20.0}}  # on a busy machine too
@@ -224,7 +222,7 @@ def test_a_reload_keeps_what_was_chosen_unless_the_file_changed_it(served: Serve
     served.config.write_text(configuration() + "\n[plan]\nalign = false\n")
     answer = served.asked("reload")
     assert answer == holds and served.rig.content is content
-    assert served.rig.presenter.run_cell.state.settings.plan.align is False
+    assert served.rig.presenter.state.settings.plan.align is False
     served.config.write_text(configuration(scene="flat"))
     answer = served.asked("reload")
     assert (answer["scene"], answer["model"], answer["placing"]["scale"]) == ("flat", "balanced", 1.5)
@@ -285,77 +283,6 @@ def test_a_command_that_fails_unexpectedly_is_refused_and_the_run_continues(
     assert served.asked("pause")["paused"] is True
 
 
-SLOW = """
-import threading
-import numpy as np
-from phasestack import ContentSource
-
-GATE, MADE, CLOSED = threading.Event(), threading.Event(), []
-
-
-class Scene(ContentSource):
-    def __init__(self, options, *, stack, context):
-        super().__init__(options, stack=stack, context=context)
-        MADE.set()
-        assert GATE.wait(60.0)
-
-    def render(self, view, *, time_ns):
-        return np.full((view.height_px, view.width_px, 4), 200, np.uint8)
-
-    def close(self):
-        CLOSED.append(threading.current_thread().name)
-"""
-
-
-@pytest.fixture
-def slow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """Module with a scene class whose constructor waits for its gate."""
-    (tmp_path / "slow_scene.py").write_text(SLOW)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    module = importlib.import_module("slow_scene")
-    yield module
-    module.GATE.set()
-    del sys.modules["slow_scene"]
-
-
-def test_a_scene_that_never_loads_is_refused_and_never_shown(
-    served: Served, slow: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The abandoned thread, once it continues, neither publishes its scene nor closes the new solver's."""
-    rig, solver = served.rig, served.rig.presenter.solver
-
-    def meanwhile() -> None:
-        patient = not slow.MADE.is_set() or solver.restarts
-        solver._late_ns = solver._abandon_ns = 60 * NS_PER_S if patient else 1
-
-    monkeypatch.setattr(LIMITS, "load_s", 0.0)
-    answer = served.asked("scene", "slow_scene:Scene", meanwhile=meanwhile)
-    assert not answer["ok"] and "so the solver was restarted with the old settings" in answer["error"]
-    rig.refresh_until_solved()
-    content, (hung,) = rig.content, solver._hung
-    slow.GATE.set()
-    hung.thread.join(30.0)
-    assert [hung.thread.name] == slow.CLOSED
-    assert rig.content is content and rig.content.info.name == "demo" and rig.run.maker.parts.is_newest
-    accounts = rig.refreshes_for(0.5)
-    assert all(account.solution is not None for account in accounts) and rig.presenter.missing == {}
-    assert served.asked("scene", "sparse")["scene"] == "sparse"
-
-
-def test_a_scene_that_loads_slower_than_a_step_is_shown_when_ready(served: Served, slow: Any) -> None:
-    solver = served.rig.presenter.solver
-    before = len(served.rig.accounts)
-
-    def meanwhile() -> None:
-        solver._late_ns = solver._abandon_ns = 1 if slow.MADE.is_set() else 60 * NS_PER_S
-        if slow.MADE.is_set() and len(served.rig.accounts) > before + 50:
-            solver._late_ns = solver._abandon_ns = 60 * NS_PER_S
-            slow.GATE.set()
-
-    assert served.asked("scene", "slow_scene:Scene", meanwhile=meanwhile)["scene"] == "slow_scene:Scene"
-    assert solver.restarts == 0
-
-
 @pytest.mark.parametrize("where", ["imported", "made", "drawn"])
 def test_a_scene_that_ends_the_process_does_not_block_later_changes(
     served: Served, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
@@ -391,13 +318,13 @@ def test_changes_load_one_at_a_time_and_only_the_newest_waits(served: Served, mo
     """Twenty models were loaded side by side: 4 GB."""
     real, at_once, begun = reconfigure.ready_predictor, [0, 0], []
 
-    def ready(settings: Settings, stack: Any) -> Any:
+    def ready(settings: Settings, stack: Any, **how: Any) -> Any:
         begun.append(settings.model.name)
         at_once[0] += 1
         at_once[1] = max(at_once)
         try:
             time.sleep(0.3)
-            return real(settings, stack)
+            return real(settings, stack, **how)
         finally:
             at_once[0] -= 1
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import gc
 import threading
 import time
-import weakref
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime.clock import NS_PER_S, MonotonicClock
+from runtime.clock import MonotonicClock
 from runtime.daemon.build import Host
 from runtime.daemon.notify import Notifier
 from runtime.errors import ContentFailure, ModelFailure, SensorLost
@@ -38,22 +36,6 @@ def rig(running: Rig) -> Iterator[Rig]:
     yield running
     running.mend()
     running.refresh_until(TRACKING)
-
-
-@pytest.fixture
-def steady() -> Iterator[Rig]:
-    """Running rig with limits that even a busy machine does not exceed."""
-    with Rig(
-        late_s=60.0,
-        abandon_s=600.0,
-        open_timeout_s=20.0,
-        sensor={"timeout_s": 5.0},
-        tracker={"hold_s": 20.0},
-        plan={"enabled": False},
-    ) as made:
-        made.refresh_until(TRACKING)
-        made.refresh_until_solved()
-        yield made
 
 
 def presented_all(accounts: list[RefreshAccount]) -> bool:
@@ -134,63 +116,6 @@ def test_content_that_raises_keeps_the_last_picture(
         assert account.presented
         assert presented_all(rig.refreshes(20))
     rig.refresh_until(TRACKING)
-
-
-# --- a solver that is slow, fails or hangs costs no refresh --------------------------------------------------------
-
-
-class Slow:
-    """The next solution does not return until `gate` is set; `begun` is set once it has begun."""
-
-    def __init__(self, rig: Rig) -> None:
-        self.begun, self.gate = threading.Event(), threading.Event()
-        self._predictor = rig.break_predictor()
-        rig.refresh_until_solved(times=2)
-        self._predictor.answer = self._answer
-        rig.refresh_until(self.begun.is_set)
-
-    def _answer(self, job: Any) -> Any:
-        self._predictor.answer = None
-        self.begun.set()
-        self.gate.wait(60.0)
-        return self._predictor.well(job)
-
-
-def asleep(rig: Rig, solver: Any) -> list[RefreshAccount]:
-    """A hundred refreshes during one solution, which is then reported as late."""
-    number = rig.presenter.last.solution.number
-    accounts = rig.refreshes(100)  # any that waited for it would not return
-    assert {account.solution for account in accounts} == {number}
-    assert presented_all(accounts)
-    assert len({account.eyes_m.tobytes() for account in accounts}) > 20
-    solver._late_ns = 1
-    rig.refresh_until("degraded: model")
-    assert "has not answered" in rig.presenter.machine.reason
-    solver._late_ns = 60 * NS_PER_S
-    return accounts
-
-
-def test_a_model_that_never_returns_is_abandoned_and_its_resources_freed(steady: Rig) -> None:
-    held = weakref.ref(steady.run.parts)
-    slow, solver = Slow(steady), steady.presenter.solver
-    try:
-        asleep(steady, solver)
-        before = steady.predictor
-        solver._late_ns = solver._abandon_ns = 1
-        steady.presenter.refresh()
-        solver._late_ns, solver._abandon_ns = 60 * NS_PER_S, 600 * NS_PER_S
-        steady.refresh_until_solved(times=2)
-        steady.refresh_until(TRACKING)
-        assert (solver.restarts, steady.presenter.stats.dropped) == (1, 0)
-        (hung,) = solver._hung
-        assert hung.thread.is_alive() and steady.predictor is not before
-        del before
-        slow.gate.set()
-        hung.thread.join(60.0)
-        gc.collect()
-        assert held() is None, "the solver that hung, with its context, content and model"
-    finally:
-        slow.gate.set()
 
 
 # --- the watchdog --------------------------------------------------------------------------------------------------

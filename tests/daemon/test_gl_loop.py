@@ -14,8 +14,7 @@ import pytest
 
 from runtime.clock import NS_PER_S
 from runtime.config import Settings
-from runtime.daemon.solver_parts import SolverMaker
-from runtime.eyes.calibration import load_calibration
+from runtime.daemon.solver_parts import RunningSolver, SolverSetup
 from runtime.optics.presentation import shown_layers
 from runtime.optics.stack import PanelStack
 from runtime.panels.display import glfw
@@ -43,8 +42,7 @@ def test_pictures_in_textures_are_solved_as_pictures_in_arrays_are(scene: str, m
         tables = {"model": {"name": "balanced", "threads": 1, "backend": backend}, "content": {"scene": scene}}
         context = offscreen_context()
         with context:
-            maker = SolverMaker(Settings.model_validate(tables), STACK, load_calibration(None))
-            made = maker(context=context, simulated=True)
+            made = RunningSolver(SolverSetup(Settings.model_validate(tables), STACK, simulated=True), context=context)
             made.step(request)
             solution = made.step(request).solution
             assert solution is not None
@@ -65,13 +63,13 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[xserver.
 def test_panels_show_opengl_s_solution_and_a_returning_monitor_keeps_the_solver(server: xserver.XServer) -> None:
     with Rig(**ON_WINDOWS) as rig:
         rig.refresh_until_solved(times=2)
-        parts = rig.run.parts
+        parts = rig.parts
         server.unplug(1)
         rig.refresh_until(lambda: "panel" in rig.presenter.missing)
         server.plug(1)
         rig.refresh_until(lambda: "panel" not in rig.presenter.missing)
         rig.refresh_until_solved()
-        assert rig.run.parts is parts and parts.backend.backend.name == "gl"
+        assert rig.parts is parts and parts.backend.backend.name == "gl"
         rig.presenter.paused = True
         rig.settle()
         frame = rig.presenter.last.frame  # type: ignore[union-attr]
@@ -86,16 +84,16 @@ def test_contexts_lost_by_the_panels_are_remade_with_the_solver_without_leaks(
     server: xserver.XServer, monkeypatch: pytest.MonkeyPatch, losses: int
 ) -> None:
     monkeypatch.setattr("runtime.panels.drawing.draws_in_software", lambda context: False)  # as if there were a GPU
-    with Rig(**ON_WINDOWS, abandon_s=0.2) as rig:
+    with Rig(**ON_WINDOWS, in_process=True) as rig:
         rig.refresh_until_solved()
         connected, held = connection(), {}
         for loss in range(losses):
-            parts, lost = rig.run.parts, rig.presenter.panels.contexts_lost
+            restarts, lost = rig.presenter.solver.restarts, rig.presenter.panels.contexts_lost
             with monkeypatch.context() as reset:
                 reset.setattr("runtime.panels.drawing._reset_status", lambda: "the driver reset the GPU (0x8253)")
                 rig.refresh_until(lambda: "panel" in rig.presenter.missing)
             assert rig.presenter.panels.contexts_lost == lost + 1
-            rig.refresh_until(lambda before=parts: rig.run.parts is not before and not rig.presenter.missing)
+            rig.refresh_until(lambda n=restarts: rig.presenter.solver.restarts > n and not rig.presenter.missing)
             assert rig.refresh_until_solved().presented
             rig.accounts.clear()
             if loss in (losses // 3, losses - 1):

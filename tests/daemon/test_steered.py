@@ -33,7 +33,7 @@ def test_a_scene_is_moved_at_once_and_put_back(tmp_path: Path) -> None:
             "scale": 1.5, "offset_m": [0.0, 0.1, 0.0], "rotation_deg": [0.0, 0.0, 0.0], "turntable_per_min": 6.0,
         }  # fmt: skip
         assert served.asked("place", None)["ok"]
-        assert served.status()["placing"]["scale"] == 1.0 and not served.run.parts.content.info.moving
+        assert served.status()["placing"]["scale"] == 1.0 and not served.rig.content.info.moving
 
 
 def test_a_place_that_is_none_is_refused_and_the_scene_stays(tmp_path: Path) -> None:

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from runtime.clock import NS_PER_MS, NS_PER_S, SimulatedClock
 from runtime.config import Settings
+from runtime.content.base import ContentInfo
 from runtime.errors import EndOfRecording, PanelLost
 from runtime.eyes.calibration import load_calibration
 from runtime.frame.effort import Costs, simulated_costs
+from runtime.frame.messages import Answer, Facts, Live, Order, SolverUpdate
 from runtime.frame.pacing import Pacer
 from runtime.frame.presenter import Presenter, Refresh
-from runtime.frame.run_state import RunCell
-from runtime.frame.solver import SolverUpdate
-from runtime.frame.solver_host import SolverHost, Task
+from runtime.frame.run_state import RunState
+from runtime.frame.solver_host import SolverHost
 from runtime.frame.viewer import Viewer
 from runtime.optics.stack import PanelStack
 from runtime.panels.base import PanelSink
@@ -77,15 +78,27 @@ class FakeSamples(Samples):
         """Do nothing."""
 
 
+def facts(settings: Settings, **changes: Any) -> Facts:
+    """Of a model without steps that solves on the full raster."""
+    named: dict[str, Any] = {"model": "model", "provider": "none", "reductions": (1,), "steps": 0, "refined_steps": 0}
+    more = {"backend": "cpu", "backend_why": ""}
+    return Facts(
+        **({"version": 0, "scene": 1, "settings": settings, "info": ContentInfo("content")} | named | more | changes)
+    )
+
+
 class FakeSolver(SolverHost):
     """Returns a test's results, and records its requests."""
 
     def __init__(self, *, cost_ns: int = 20 * NS_PER_MS) -> None:
+        super().__init__()
         self.solve_cost_ns = cost_ns
-        self.reductions: tuple[int, ...] = (1,)
+        self.reductions: tuple[int, ...] = (1,)  # whose costs are known
+        self.offered: tuple[int, ...] = (1,)  # by the model
         self.there = SolverUpdate()
         self.requests: list[SolveRequest] = []
-        self.tasks: list[Task] = []
+        self.orders: list[Order] = []
+        self.settings = Settings()
 
     @property
     def costs(self) -> Costs:
@@ -103,8 +116,16 @@ class FakeSolver(SolverHost):
     def news(self) -> SolverUpdate:
         return self.there
 
-    def do(self, task: Task) -> None:
-        self.tasks.append(task)
+    @property
+    def facts(self) -> Facts:
+        return facts(self.settings, reductions=self.offered)
+
+    @property
+    def live(self) -> Live:
+        return Live()
+
+    def _dispatch(self, order: Order) -> None:
+        self.orders.append(order)
 
     def close(self) -> None:
         """Do nothing."""
@@ -145,6 +166,9 @@ class FakeParts:
     def __init__(self, step: Callable[[SolveRequest], SolverUpdate], stage_ms: dict[str, float] | None = None) -> None:
         self.behave, self.stage_ms = step, stage_ms or {}
         self.asked: list[SolveRequest] = []
+        self.orders: list[Order] = []
+        self.answer: Callable[[Order], Answer] | None = None
+        self.late: list[Answer] = []  # answers of the next turn
         self.closed = 0  # times
         self.costs_at_ns: list[int] = []
 
@@ -154,6 +178,18 @@ class FakeParts:
 
     def simulated_costs(self) -> Costs:
         return simulated_costs(self.stage_ms, (1,))
+
+    def turn(self, orders: Sequence[Order]) -> list[Answer]:
+        self.orders += orders
+        late, self.late = self.late, []
+        return [*late, *(self.answer(order) for order in orders if self.answer is not None)]
+
+    @property
+    def facts(self) -> Facts:
+        return facts(Settings())
+
+    def live(self, time_ns: int) -> Live:
+        return Live()
 
     def first_costs(self, *, time_ns: int) -> dict[int, dict[str, float]]:
         self.costs_at_ns.append(time_ns)
@@ -188,11 +224,10 @@ class Stage:
         self.samples, self.solver, self.panels = FakeSamples(), FakeSolver(), FakePanels(self.clock)
         self.watching = Watching()
         calibration = load_calibration(None)
-        self.cell = RunCell(self.settings, calibration=calibration, content=Named("content"), predictor=Named("model"))
         self.viewer = Viewer(self.settings, calibration, front_m=max(STACK.x_m), in_stack_frame=True)
         self.pacer = Pacer(period_ns=PERIOD_NS, photon_ns=8 * NS_PER_MS, work_ns=round(1.2 * NS_PER_MS))
         self.presenter = Presenter(
-            self.cell,
+            RunState(0, self.settings, calibration),
             STACK,
             clock=self.clock,
             pacer=self.pacer,
@@ -221,17 +256,5 @@ class Stage:
 
     def change(self, **plan: Any) -> None:
         """Other settings of the plan hold from the next refresh on."""
-        settings = self.cell.state.settings
-        changed = settings.model_copy(update={"plan": settings.plan.model_copy(update=plan)})
-        self.cell.replace(settings=changed)
-
-
-class Named:
-    """Content or a model of which only the name is asked."""
-
-    provider = "none"
-    reductions: tuple[int, ...] = (1,)
-    steps, refined_steps = 0, 0
-
-    def __init__(self, name: str) -> None:
-        self.name = name
+        settings = self.presenter.state.settings
+        self.presenter.adopt(settings.model_copy(update={"plan": settings.plan.model_copy(update=plan)}))

@@ -11,14 +11,15 @@ import numpy as np
 import pytest
 
 from runtime.clock import NS_PER_MS, NS_PER_S
+from runtime.config import Settings
 from runtime.content.base import ContentInfo, ContentSource, View
 from runtime.evaluation import refresh_quality
 from runtime.evaluation.displayed import displayed
 from runtime.frame import refresh_lines, sampling
+from runtime.frame.messages import Draw, Facts, Order
 from runtime.frame.observer import RunObserver
 from runtime.frame.presenter import Refresh
-from runtime.frame.solver_host import Task
-from runtime.frame.targets import TargetDrawer
+from runtime.frame.targets import TargetDrawer, drawn
 from runtime.model.predictor import Predictor
 from runtime.optics.alignment import align
 from runtime.optics.carried import carried_db, expected_psnrs_db
@@ -27,7 +28,7 @@ from runtime.plan.drawing import drawn_job, retina_pictures
 from runtime.records import PanelFrame, RefreshAccount, SensorFrame, Solution, State
 from runtime.support.background import wait_for_all
 from tests.frame.conftest import SMALL
-from tests.frame.fakes import EYES, FakeSolver, aside
+from tests.frame.fakes import EYES, FakeSolver, aside, facts
 from tests.waiting import eventually
 
 PERIOD_NS = 20 * NS_PER_MS
@@ -57,17 +58,27 @@ class Kept:
 
 
 class Drawing(FakeSolver):
-    """A solver whose thread runs tasks immediately, or on request."""
+    """A solver that draws immediately, or on request."""
 
     def __init__(self, content: Any, *, at_once: bool = True) -> None:
         super().__init__()
-        self.content, self.at_once = content, at_once
+        self.content, self.at_once, self.scene, self.fov_deg = content, at_once, 1, FOV_DEG
 
-    def do(self, task: Task) -> None:
+    @property
+    def facts(self) -> Facts:
+        settings = Settings.model_validate({"content": {"fov_deg": self.fov_deg}})
+        return facts(settings, scene=self.scene)
+
+    def _dispatch(self, order: Order) -> None:
+        super()._dispatch(order)
         if self.at_once:
-            task(self)  # type: ignore[arg-type]
-        else:
-            self.tasks.append(task)
+            self.draw()
+
+    def draw(self) -> None:
+        """Carry out the oldest order."""
+        order = self.orders.pop(0)
+        assert isinstance(order, Draw)
+        self._answered(drawn(order, self.content, scene=self.scene, stack=SMALL))
 
 
 @pytest.fixture
@@ -102,7 +113,7 @@ def looking(
     content: Any, *, solver: Drawing | None = None, simulated: bool = True, **how: Any
 ) -> tuple[RunObserver, Kept]:
     kept = Kept()
-    drawer = TargetDrawer(solver or Drawing(content), SMALL, fov_deg=lambda: FOV_DEG)
+    drawer = TargetDrawer(solver or Drawing(content))
     return RunObserver(SMALL, drawer, output=kept, simulated=simulated, **how), kept
 
 
@@ -247,7 +258,7 @@ def test_who_stops_a_run_waits_for_no_measurement(content: ContentSource, solved
     observer, _ = looking(content, solver=solver, simulated=False, evaluate_every=50)
     observer.refreshed(refresh(1, solved))
     observer.finish(lambda: True)
-    assert observer.moment is None and solver.tasks == []
+    assert observer.moment is None and solver.orders == []
 
 
 def test_who_stops_a_run_begins_no_measurement_and_keeps_the_last(content: ContentSource, solved: Solution) -> None:
@@ -255,10 +266,10 @@ def test_who_stops_a_run_begins_no_measurement_and_keeps_the_last(content: Conte
     observer, _ = looking(content, solver=solver, simulated=False, evaluate_every=1)
     observer.refreshed(refresh(1, solved))
     observer.refreshed(refresh(2, solved))  # queued
-    assert solver.tasks.pop()(solver) is True
+    solver.draw()
     assert wait_for_all(120.0) == 0
     observer.finish(lambda: True)
-    assert solver.tasks == []
+    assert solver.orders == []
     assert observer.summary()["quality_frames"] == 1
 
 
@@ -269,8 +280,8 @@ def test_in_real_time_one_measurement_runs_at_a_time_and_delays_nothing(
     observer, _ = looking(content, solver=solver, simulated=False, evaluate_every=1)
     for number in range(10):
         observer.refreshed(refresh(number, solved))
-    assert len(solver.tasks) == 1  # the solver's thread draws when it comes to it
-    assert solver.tasks[0](solver) is True
+    assert len(solver.orders) == 1  # the solver's thread draws when it comes to it
+    solver.draw()
     assert wait_for_all(120.0) == 0
     observer.refreshed(refresh(10, solved))
     assert observer.summary()["quality_frames"] == 1
@@ -284,10 +295,10 @@ def test_measuring_takes_only_its_share_of_a_real_time_run(
     solver = Drawing(content, at_once=False)
     observer, _ = looking(content, solver=solver, simulated=False, evaluate_every=1)
     observer.refreshed(refresh(0, solved))
-    assert solver.tasks.pop()(solver) is True
+    solver.draw()
     assert wait_for_all(120.0) == 0
     observer.refreshed(refresh(1, solved))
-    assert len(solver.tasks) == begun
+    assert len(solver.orders) == begun
 
 
 def test_queued_layers_are_few_and_small(
@@ -306,7 +317,7 @@ def test_a_few_samples_that_came_meanwhile_are_measured_at_the_end(content: Cont
     for number in range(2 * sampling.HELD_MAX):
         observer.sampled(sample(NS_PER_S + number * PERIOD_NS))
         observer.refreshed(refresh(number, solved))
-    assert solver.tasks.pop()(solver) is True  # the first one's
+    solver.draw()  # the first one's
     solver.at_once = True
     observer.finish()
     last = 2 * sampling.HELD_MAX - 1
@@ -424,15 +435,11 @@ def test_a_coarse_solution_is_measured_as_the_panels_show_it(content: ContentSou
 
 
 def test_a_reload_draws_the_new_scene_in_its_field_of_view(content: ContentSource, solved: Solution) -> None:
-    shown: list[Any] = [content]
-    fovs_deg = [FOV_DEG]
     solver, kept = Drawing(content), Kept()
-    drawer = TargetDrawer(solver, SMALL, fov_deg=lambda: fovs_deg[-1], shown_content=lambda: shown[0])
-    observer = RunObserver(SMALL, drawer, evaluate_every=1, keep_light=1, output=kept, simulated=True)
+    observer = RunObserver(SMALL, TargetDrawer(solver), evaluate_every=1, keep_light=1, output=kept, simulated=True)
     observer.sampled(sample(NS_PER_S))
     observer.refreshed(refresh(1, solved))
-    shown[0] = solver.content = Moving()
-    fovs_deg.append(30.0)
+    solver.content, solver.scene, solver.fov_deg = Moving(), 2, 30.0
     observer.sampled(sample(NS_PER_S + 3 * PERIOD_NS))
     observer.refreshed(refresh(2, solved))
     observer.finish()
@@ -498,7 +505,7 @@ def test_every_nth_refresh_leaves_what_a_judge_needs(content: ContentSource, sol
         observer.sampled(sample(seen.account.photon_ns, y_m=number / 400))
         observer.refreshed(seen)
     assert list(kept.lights) == [3, 7, 11]
-    assert solver.tasks == [], "drawing waits for the end of the run"
+    assert solver.orders == [], "drawing waits for the end of the run"
     solver.at_once = True
     observer.finish()
     drawn = retina_pictures(content, EYES, SMALL, fov_deg=FOV_DEG, time_ns=0)

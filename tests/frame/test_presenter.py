@@ -15,7 +15,7 @@ from runtime.optics.alignment import align
 from runtime.plan.savings import selected_eyes
 from runtime.records import State
 from tests.frame import fakes
-from tests.frame.fakes import EYES, HZ, PERIOD_NS, STACK, Named, Stage, aside, picture, solution
+from tests.frame.fakes import EYES, HZ, PERIOD_NS, STACK, Stage, aside, picture, solution
 
 
 def moves(time_s: float) -> np.ndarray:
@@ -367,9 +367,9 @@ def test_every_sample_reaches_the_viewer_and_the_observer_in_order() -> None:
 
 
 def test_other_settings_reach_the_viewer_with_the_next_refresh(stage: Stage) -> None:
-    settings = stage.cell.state.settings
+    settings = stage.presenter.state.settings
     tracker = settings.tracker.model_copy(update={"hold_s": 0.0})
-    stage.cell.replace(settings=settings.model_copy(update={"tracker": tracker}))
+    stage.presenter.adopt(settings.model_copy(update={"tracker": tracker}))
     stage.eyes = lambda _: None
     stage.refresh(30)
     assert stage.presenter.machine.state is State.FLAT
@@ -398,9 +398,7 @@ def test_panels_that_take_longer_than_a_period_are_told_by_the_presenter() -> No
 
 def test_a_model_whose_rasters_are_not_timed_yet_stops_no_refresh(stage: Stage) -> None:
     """A model is replaced on the solver's thread; the presenter may see it before its costs are known."""
-    model = Named("model of four rasters")
-    model.reductions = (1, 2, 3, 4)
-    stage.cell.replace(predictor=model)
+    stage.solver.offered = (1, 2, 3, 4)
     stage.eyes = moves
     stage.refresh(30)
     assert {request.effort.reduction for request in stage.solver.requests[-30:]} == {1}
@@ -429,10 +427,9 @@ def test_a_display_of_a_few_hertz_stops_no_refresh(monkeypatch: pytest.MonkeyPat
 
 def test_a_calm_head_gets_longer_solutions_within_a_second() -> None:
     """The longer a head has been calm, the less it matters that panels cannot answer while a solution is computed."""
-    stage, model = Stage(), Named("model of four rasters")
-    model.reductions = stage.solver.reductions = (1, 2, 3, 4)
+    stage = Stage()
+    stage.solver.offered = stage.solver.reductions = (1, 2, 3, 4)
     stage.solver.solve_cost_ns = 600 * NS_PER_MS
-    stage.cell.replace(predictor=model)
     stage.eyes = lambda time_s: aside(0.002 * np.sin(2 * time_s))
     stage.refresh(HZ)
     asked = [request.effort.reduction for request in stage.solver.requests]
@@ -444,10 +441,9 @@ def test_a_head_that_has_rested_counts_as_one_that_never_moved() -> None:
     """The speed before the rest says nothing about a head that stirs after it."""
 
     def asked(before: Callable[[float], Any]) -> list[int]:
-        stage, model = Stage(plan={"enabled": True}), Named("model of four rasters")
-        model.reductions = stage.solver.reductions = (1, 2, 3, 4)
+        stage = Stage(plan={"enabled": True})
+        stage.solver.offered = stage.solver.reductions = (1, 2, 3, 4)
         stage.solver.solve_cost_ns = 150 * NS_PER_MS
-        stage.cell.replace(predictor=model)
         stage.eyes = lambda time_s: before(time_s) if time_s < 2.0 else aside(0.01 * max(time_s - 6.0, 0.0))
         stage.refresh(6 * HZ)
         assert stage.solver.requests[-1].eyes_label == "rested"
@@ -464,10 +460,9 @@ def test_a_viewer_of_whom_one_eye_sees_gets_no_coarser_solutions() -> None:
     beside_m = np.array([[0.123, 0.43, 0.0], [0.078, 0.47, 0.0]])
 
     def asked(seeing: tuple[bool, bool]) -> list[int]:
-        stage, model = Stage(), Named("model of four rasters")
-        model.reductions = stage.solver.reductions = (1, 2, 3, 4)
+        stage = Stage()
+        stage.solver.offered = stage.solver.reductions = (1, 2, 3, 4)
         stage.solver.solve_cost_ns = 150 * NS_PER_MS
-        stage.cell.replace(predictor=model)
         stage.eyes = lambda _: beside_m
         for number in range(HZ):
             stage.refresh()
@@ -483,10 +478,8 @@ def test_a_viewer_of_whom_one_eye_sees_gets_no_coarser_solutions() -> None:
 
 def test_a_moving_head_about_to_be_given_up_gets_no_long_solution(stage: Stage) -> None:
     """Otherwise the solver is busy when the head comes back."""
-    model = Named("model of four rasters")
-    model.reductions = stage.solver.reductions = (1, 2, 3, 4)
+    stage.solver.offered = stage.solver.reductions = (1, 2, 3, 4)
     stage.solver.solve_cost_ns = 400 * NS_PER_MS
-    stage.cell.replace(predictor=model)
     stage.eyes = moves
     stage.refresh(90)
     stage.eyes = lambda _: None

@@ -13,8 +13,7 @@ from runtime.config import ContentSettings, Settings, changed
 from runtime.content.base import ContentSource
 from runtime.content.registry import open_content
 from runtime.errors import ContentFailure, ModelFailure
-from runtime.eyes.calibration import load_calibration
-from runtime.frame.run_state import RunCell
+from runtime.frame.run_state import SceneCell
 from runtime.frame.solver import Solver, SolverUpdate
 from runtime.model.predictor import Predictor
 from runtime.plan.drawing import drawn_job
@@ -28,27 +27,27 @@ def wish(eyes_m: Any = EYES, *, time_ns: int = 0, sigma_m: float = 0.001, flat: 
 
 
 @pytest.fixture
-def cell(content: ContentSource, predictor: Predictor) -> RunCell:
+def cell(content: ContentSource, predictor: Predictor) -> SceneCell:
     settings = Settings.model_validate({"model": {"name": "fast", "threads": 1}})
-    return RunCell(settings, calibration=load_calibration(None), content=content, predictor=predictor)
+    return SceneCell(settings, content=content, predictor=predictor)
 
 
 @pytest.fixture
-def solver(cell: RunCell) -> Solver:
+def solver(cell: SceneCell) -> Solver:
     """With its flat picture drawn."""
     made = Solver(cell, SMALL)
     assert made.step(wish(None, flat=True)).flat is not None
     return made
 
 
-def test_the_flat_picture_is_for_eyes_anywhere_and_equal_along_every_ray(cell: RunCell) -> None:
+def test_the_flat_picture_is_for_eyes_anywhere_and_equal_along_every_ray(cell: SceneCell) -> None:
     flat = Solver(cell, SMALL).step(wish(None, flat=True)).flat
     assert flat.solved_for_m is None
     assert flat.layers.shape == (3, 108, 192, 4)
     assert set(flat.stage_ms) == {"render"}
 
 
-def test_a_solution_is_the_model_s_answer_to_the_content_s_pictures(solver: Solver, cell: RunCell) -> None:
+def test_a_solution_is_the_model_s_answer_to_the_content_s_pictures(solver: Solver, cell: SceneCell) -> None:
     state = cell.state
     solution = solver.step(wish(time_ns=77)).solution
     job = drawn_job(state.predictor, state.content, EYES, time_ns=77, trimmed=True)
@@ -60,7 +59,7 @@ def test_a_solution_is_the_model_s_answer_to_the_content_s_pictures(solver: Solv
     assert solution.layers.std() > 5
 
 
-def test_a_solver_that_is_made_anew_gives_no_number_a_second_time(solver: Solver, cell: RunCell) -> None:
+def test_a_solver_that_is_made_anew_gives_no_number_a_second_time(solver: Solver, cell: SceneCell) -> None:
     """Sinks know layers by their number: the same one for other layers would leave the old ones on the panels."""
     numbers = [solver.step(wish(aside(k / 100))).solution.number for k in range(3)]
     anew = Solver(cell, SMALL)
@@ -84,7 +83,7 @@ def test_the_same_eyes_and_content_are_not_solved_for_twice(solver: Solver) -> N
     assert solver.step(wish(aside(0.001))).solution is not None
 
 
-def test_another_state_is_solved_for_with_its_own_parts(solver: Solver, cell: RunCell, shared_context: Any) -> None:
+def test_another_state_is_solved_for_with_its_own_parts(solver: Solver, cell: SceneCell, shared_context: Any) -> None:
     first = solver.step(wish()).solution
     other = open_content(ContentSettings(scene="texture"), SMALL, shared_context)
     cell.replace(content=other)
@@ -94,7 +93,7 @@ def test_another_state_is_solved_for_with_its_own_parts(solver: Solver, cell: Ru
     other.close()
 
 
-def test_content_that_moves_is_solved_for_at_its_instant(solver: Solver, cell: RunCell, shared_context: Any) -> None:
+def test_content_that_moves_is_solved_for_at_its_instant(solver: Solver, cell: SceneCell, shared_context: Any) -> None:
     moving = open_content(ContentSettings(scene="moving"), SMALL, shared_context)
     cell.replace(content=moving)
     layers = [solver.step(wish(time_ns=t)).solution.layers for t in (0, NS_PER_S // 3)]
@@ -107,7 +106,7 @@ def test_less_certain_eyes_get_a_more_tolerant_solution(solver: Solver) -> None:
     assert sigmas == pytest.approx([0.0, 0.001, 0.002, 0.003]), "the tracker's alone"
 
 
-def test_after_its_budget_no_further_step_begins_but_on_a_simulated_clock(cell: RunCell, solver: Solver) -> None:
+def test_after_its_budget_no_further_step_begins_but_on_a_simulated_clock(cell: SceneCell, solver: Solver) -> None:
     whole = solver.step(wish()).solution.layers.copy()
     cell.replace(settings=changed(cell.state.settings, "model", {"budget_ms": 1e-3}, source="a test"))
     limited, simulated = (Solver(cell, SMALL, timed=timed) for timed in (True, False))
@@ -139,15 +138,15 @@ def test_a_coarse_solution_is_not_continued_in_place_of_an_earlier_one(solver: S
 OFF_M = np.array([[0.123, 0.43, 0.0], [0.078, 0.47, 0.0]])  # the right eye is 80.6 degrees off the axis
 
 
-def test_an_eye_beside_the_display_gets_the_other_s_picture(solver: Solver, cell: RunCell) -> None:
+def test_an_eye_beside_the_display_gets_the_other_s_picture(solver: Solver, cell: SceneCell) -> None:
     solution = solver.step(wish(OFF_M)).solution
     assert solution.seeing == (True, False)
     assert np.array_equal(solution.solved_for_m, OFF_M[[0, 0]])
-    assert "the right eye" in [item.what for item in solver.plan_items()]
+    assert "the right eye" in [item.what for item in solver.plan.items] and solver.seeing == (True, False)
     assert solver.step(wish()).solution.seeing == (True, True)
 
 
-def test_the_flat_picture_is_drawn_from_the_middle_of_the_last_eyes(solver: Solver, cell: RunCell) -> None:
+def test_the_flat_picture_is_drawn_from_the_middle_of_the_last_eyes(solver: Solver, cell: SceneCell) -> None:
     solver.step(wish(aside(0.25)))
     aside_flat = solver.step(wish(None, flat=True)).flat.layers
     solver.step(wish(aside(-0.25)))
@@ -208,7 +207,7 @@ def test_a_flat_picture_does_not_end_the_model_s_fault(
 
 
 def test_where_even_the_flat_picture_fails_a_uniform_one_is_shown(
-    cell: RunCell, content: ContentSource, monkeypatch: pytest.MonkeyPatch
+    cell: SceneCell, content: ContentSource, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
         broken(content, "render", ContentFailure("gone"), patch)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import pytest
 
 from runtime.clock import NS_PER_MS, SimulatedClock
-from runtime.frame.solver import SolverUpdate
+from runtime.frame.messages import Answer, Done, Progress, Skip, SolverUpdate
 from runtime.frame.solver_host import SimulatedSolver
 from runtime.records import Effort, SolveRequest
 from tests.frame.fakes import FakeParts, aside, solution
@@ -140,18 +139,21 @@ def test_what_failed_is_told_and_the_last_solution_stays(
     assert host.news().missing == {}
 
 
-def test_a_task_is_done_at_once_or_retried_at_every_step(host: SimulatedSolver, parts: FakeParts) -> None:
-    seen: list[Any] = []
+def test_an_order_is_carried_out_at_once_and_its_answer_passed_on(host: SimulatedSolver, parts: FakeParts) -> None:
+    answers: list[Answer] = []
+    parts.answer = lambda order: Done(order.number, "refused")
+    number = host.send(Skip(5), answers.append)
+    assert parts.orders == [Skip(5, number)] and answers == [Done(number, "refused")]
 
-    def task(given: Any) -> bool:
-        seen.append(given)
-        return len(seen) == 3
 
-    host.do(task)
-    assert seen == [parts]
-    for number in range(4):
-        host.post(wish(number))
-    assert seen == [parts] * 3
+def test_an_order_that_takes_longer_is_answered_later_and_once(host: SimulatedSolver, parts: FakeParts) -> None:
+    answers: list[Answer] = []
+    number = host.send(Skip(5), answers.append)
+    host.post(wish(1))
+    assert answers == []
+    parts.late = [Progress(number, "reading"), Done(number), Done(number)]
+    host.look()
+    assert answers == [Progress(number, "reading"), Done(number)]
 
 
 def test_a_cost_that_changes_is_told(host: SimulatedSolver, parts: FakeParts, clock: SimulatedClock) -> None:

@@ -7,9 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from runtime.daemon.reconfigure import Reconfiguration
 from runtime.errors import ModelFailure
+from runtime.frame.messages import Answer, ChangeSettings, Done
 from runtime.frame.presenter import Presenter
+from runtime.frame.solver_host import SimulatedSolver
 from tests.golden.recordings import path_to
 
 Action = Callable[[Presenter], None]
@@ -58,21 +59,29 @@ def change_scene(name: str) -> Action:
     """`ctl scene`, complete before the simulated clock continues."""
 
     def do(presenter: Presenter) -> None:
-        present = presenter.run_cell.state.settings
+        present = presenter.state.settings
         settings = present.model_copy(update={"content": present.content.model_copy(update={"scene": name})})
-        change = Reconfiguration(lambda: settings, present, presenter.stack, reload_content=True)
-        deadline_s = time.monotonic() + LOADED_WITHIN_S
-
-        def load(parts: Any) -> bool:
-            while not change.advance(parts):
-                assert time.monotonic() < deadline_s, "the scene does not load"
-                time.sleep(0.005)
-            return True
-
-        presenter.solver.do(load)
-        assert change.finished and not change.problem, change.problem
+        deadline_s, answers = time.monotonic() + LOADED_WITHIN_S, list[Answer]()
+        presenter.solver.send(ChangeSettings(settings, reload_content=True), answers.append)
+        while not (answers and isinstance(answers[-1], Done)):
+            assert time.monotonic() < deadline_s, "the scene does not load"
+            time.sleep(0.005)
+            solver_of(presenter).look()
+        assert not answers[-1].problem, answers[-1].problem
+        presenter.adopt(settings)
 
     return do
+
+
+def solver_of(presenter: Presenter) -> SimulatedSolver:
+    assert isinstance(presenter.solver, SimulatedSolver)
+    return presenter.solver
+
+
+def model_of(presenter: Presenter) -> Any:
+    """The model, which lives in the same process on a simulated clock."""
+    parts: Any = solver_of(presenter).parts
+    return parts.run.state.predictor
 
 
 def ask_flat(presenter: Presenter) -> None:
@@ -96,12 +105,12 @@ def break_model(presenter: Presenter) -> None:
     def solve(*_: Any, **__: Any) -> Any:
         raise ModelFailure("a golden run's model is broken")
 
-    vars(presenter.run_cell.state.predictor)["solve"] = solve
+    vars(model_of(presenter))["solve"] = solve
 
 
 def mend_model(presenter: Presenter) -> None:
     """The model answers again."""
-    del vars(presenter.run_cell.state.predictor)["solve"]
+    del vars(model_of(presenter))["solve"]
 
 
 # Each panel mounted another way: none shows its layer as it is.

@@ -13,7 +13,6 @@ import moderngl
 
 from runtime.errors import ContextLost, PhasestackError
 from runtime.kernels import EDGE_CLAMP_PX, FULL
-from runtime.support.background import raise_if_abandoned
 
 INCLUDE = re.compile(r'^#include "([a-z_]+\.glsl)"$', re.MULTILINE)
 REPEATED = re.compile(r"^#for ([A-Z]+)\n(.*?)^#end\n", re.MULTILINE | re.DOTALL)
@@ -102,7 +101,6 @@ class Passes:
             counts: How often to repeat the shader's repeated lines (`source`).
             at: First column, first row, width and height of the area to draw. By default, all of the first output.
         """
-        raise_if_abandoned()
         program, array, held = self._program(name, counts)
         for unit, (key, image) in enumerate(inputs.items()):
             image.texture.use(unit)
