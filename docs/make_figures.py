@@ -102,7 +102,7 @@ def architecture() -> Figure:
     threads = (
         (0.2, 7.3, 21.6, 3.1, "#eef4fb", "sensor thread"),
         (0.2, 3.9, 21.6, 3.1, "#fdf1e7", "presenter: the display's clock, one refresh after another"),
-        (0.2, 0.5, 21.6, 3.1, "#eef8ee", "solver thread: as fast as the machine is"),
+        (0.2, 0.5, 21.6, 3.1, "#eef8ee", "solver's process: as fast as the machine is"),
     )
     for x, y, width, height, colour, name in threads:
         axes.add_patch(

@@ -34,7 +34,7 @@ from runtime.model.backends import Wanted
 from runtime.optics.stack import PanelStack
 from runtime.panels.base import PanelSink
 from runtime.panels.registry import BrowserPanels, open_panels
-from runtime.plan.savings import OPTIONAL_PARTS, Saving, make_plan
+from runtime.plan.savings import Saving, make_plan
 from runtime.records import Effort, RefreshAccount
 from runtime.sensor.base import Sensor
 from runtime.sensor.browser import BrowserCamera, BrowserEyes
@@ -49,7 +49,7 @@ log = logging.getLogger("phasestack.build")
 
 STEP_S = 10.0  # a solver that needs longer for a solution has hung
 MACHINE_BYTES = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-SOLVER_MEMORY_BYTES = round(0.75 * MACHINE_BYTES) // MIB * MIB  # without the memory shared with the presenter
+SOLVER_MEMORY_BYTES = round(0.6 * MACHINE_BYTES) // MIB * MIB  # without the memory shared with the presenter
 
 # Figures in summary.json that are determined by the configuration if the clock is simulated.
 SIMULATED_FIGURES = (
@@ -85,8 +85,7 @@ class Run:
         """Return the savings in use as dictionaries. Any time or cost that was not measured is None."""
         facts, live = self.presenter.solver.facts, self.presenter.solver.live
         known = replace(live.measured, reuse=Saving(saves_ms=self.presenter.stats.reuse_saves_ms()))
-        loaded = OPTIONAL_PARTS.keys() - facts.absent
-        plan = make_plan(facts.info, facts.settings, seeing=live.seeing, measured=known, loaded_modules=loaded)
+        plan = make_plan(facts.info, facts.settings, seeing=live.seeing, measured=known)
         return [asdict(item) for item in plan.items]
 
     def summary(self) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -38,7 +37,6 @@ from runtime.model.base import trial_eyes_m
 from runtime.model.buffers import LayerSlots
 from runtime.model.predictor import Predictor
 from runtime.optics.stack import PanelStack
-from runtime.plan.savings import OPTIONAL_PARTS
 from runtime.records import SolveRequest
 from runtime.support.gl import leave_context, offscreen_context
 
@@ -98,7 +96,12 @@ class RunningSolver:
             undo.pop_all()
         self.context = context
         self.run = SceneCell(
-            settings, content=content, predictor=predictor, scene=setup.scene, first_number=setup.first_number
+            settings,
+            content=content,
+            predictor=predictor,
+            version=setup.version,
+            scene=setup.scene,
+            first_number=setup.first_number,
         )
         self.solver = Solver(self.run, stack, timed=not setup.simulated)
         self._calibrated = None if setup.costs is None else (predictor, setup.costs)
@@ -184,7 +187,6 @@ class RunningSolver:
             predictor.refined_steps,
             predictor.backend,
             self.backend.why,
-            tuple(name for name in OPTIONAL_PARTS if name not in sys.modules),
         )
 
     def live(self, time_ns: int) -> Live:

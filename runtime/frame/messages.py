@@ -84,7 +84,6 @@ class Facts:
     refined_steps: int  # most updates of a solution that is continued
     backend: str
     backend_why: str
-    absent: tuple[str, ...] = ()  # optional modules that were not imported
 
 
 @dataclass(frozen=True, slots=True)
