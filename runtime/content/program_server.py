@@ -512,6 +512,18 @@ def acquire(port: int) -> ProgramServer:
         return server
 
 
+def addresses() -> dict[int, tuple[int, str]]:
+    """Return the port and token of each server opened so far, keyed by the port asked for."""
+    with _lock:
+        return dict(_addresses)
+
+
+def reopen_at(last: Mapping[int, tuple[int, str]]) -> None:
+    """Use the ports and tokens of servers in a process that has ended, as returned by its `addresses`."""
+    with _lock:
+        _addresses.update(last)
+
+
 def _opened(port: int) -> ProgramServer:
     last_port, token = _addresses.get(port, (port, secrets.token_urlsafe(24)))
     for attempt in (last_port, port):

@@ -279,6 +279,7 @@ def start_solver(
             device=device,
             version=facts.version,
             scene=facts.scene,
+            program_addresses=facts.program_addresses,
             first_number=known.next_number,
             costs=known.first,
             step_s=STEP_S,
