@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,8 @@ xwininfo: Window id: 0x50e (the root window) (has no name)
 """
 
 needs_x = pytest.mark.skipif(
-    shutil.which("Xvfb") is None or shutil.which("xwininfo") is None, reason="needs Xvfb and xwininfo"
+    shutil.which("Xvfb") is None or shutil.which("xwininfo") is None or find_spec("_tkinter") is None,
+    reason="needs Xvfb, xwininfo and tkinter",
 )
 
 
