@@ -17,7 +17,7 @@ from runtime.frame.presenter import Presenter
 from runtime.records import RefreshAccount
 from tests.daemon.rig import TRACKING, Rig
 
-STEP_S = 2.0
+STEP_S = 5.0
 MEMORY_BYTES = 1 << 29
 REASONS = {
     "crash": "SIGSEGV",
