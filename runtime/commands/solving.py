@@ -204,6 +204,7 @@ def solve_pictures(
                 "eye_sigma_mm": eye_sigma_mm,
                 "steps": done.answer.steps + 1,  # the network's initial layers count as one
                 "plan": [asdict(item) for item in items],
+                "retina_db": None,  # the depth of pictures is unknown
                 "notes": notes,
                 "wall_s": {part: round(ms / 1e3, 3) for part, ms in watch.stage_ms.items()},
             }

@@ -68,6 +68,11 @@ class CpuState:
         self._held.set(panel, np.ascontiguousarray(codes))
         self._resting.discard(panel)
 
+    def panel(self, panel: int) -> I16:
+        box, channels = self._geometry.boxes[panel], self._channels
+        held = self._held.last[panel, : box.height_px, : box.width_px * channels]
+        return held.reshape(box.height_px, box.width_px, channels).copy()
+
     def close_middle(self) -> None:
         self._resting.discard(self._geometry.middle)  # every pixel is written below
         self._rest_others()

@@ -29,8 +29,11 @@ class SolverState(Protocol):
     def set_panel(self, panel: int, codes: I16) -> None:
         """Set a panel's box to (rows, columns[, 3]) values in sixteenths of an 8-bit code."""
 
+    def panel(self, panel: int) -> I16:
+        """Return a panel's box as (rows, columns, channels) values in sixteenths of an 8-bit code."""
+
     def close_middle(self) -> None:
-        """Solve the middle panel for both eyes, leaving the other panels as they are."""
+        """Solve the middle panel for all views, leaving the other panels as they are."""
 
     def start(self) -> None:
         """Prepare for steps that start from the panels' current values, without momentum."""

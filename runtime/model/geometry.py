@@ -208,9 +208,13 @@ def geometry_of(
         kept: Part of the middle panel that the rays pass through. By default, the middle panel's box.
         taper_px: Width of a window's taper, right and down, in middle-panel pixels.
         points: Points of each pupil that have separate views.
+
+    Raises ValueError if the views' pictures differ in size.
     """
     box = boxes[stack.count // 2]
     kept = kept or box
+    if len(shapes := {view.picture.shape[:2] for view in views}) > 1:
+        raise ValueError(f"the views' pictures must have one size, but have {sorted(shapes)}")
     middle_from_plane = stack.panel(stack.count // 2).raster_from_plane()
     middle_from_pictures = [_snapped(middle_from_plane @ view.plane_from_picture) for view in views]
     rays = _looked_through(np.asarray(np.linalg.inv(middle_from_pictures), np.float64), kept, views[0].picture.shape)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import cv2
 import numpy as np
 
 from runtime.model.geometry import Geometry, TargetView, geometry_of, visible_boxes
@@ -75,6 +76,18 @@ class Targets:
             views = [TargetView(view.pixels, view.plane_from_picture) for view in self.views]
             self._reduced[reduction] = tuple(parallel_map(lambda view: reduced_view(view, middle, reduction), views))
         return self._reduced[reduction]
+
+    def on_raster(self, reduction: int) -> Targets:
+        """Return the targets on panels and pictures with 1/`reduction` of the rows and columns."""
+
+        def reduced(view: TargetView) -> TargetView:
+            height, width = view.picture.shape[:2]
+            size = max(1, round(width / reduction)), max(1, round(height / reduction))
+            picture = np.asarray(cv2.resize(view.pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
+            return TargetView(picture, view.plane_from_picture @ np.diag([width / size[0], height / size[1], 1.0]))
+
+        views = tuple(reduced(view) for view in self.views)
+        return Targets(self.stack.reduced(reduction), self.eyes_m, views, self.points)
 
     @cached_property
     def _reduced(self) -> dict[int, tuple[TargetView, ...]]:

@@ -169,11 +169,25 @@ class ChainProposal:
         matrix = begin @ to_frame @ seen_from_layer @ raster.plane_from_raster()
         size = raster.height_px, raster.width_px
         codes = warp(np.clip(answer, 0, FULL), matrix, size=size, outside=EVEN, image_columns=columns, threads=1)
-        if max(geometry.taper_px) > 0:
-            weights = _wave_taper(geometry, raster, middle_m)
-            weights = weights[..., None] if codes.ndim == 3 else weights
-            codes = np.rint(EVEN + (codes - np.float32(EVEN)) * weights).astype(np.int16)
+        return tapered(codes, n, geometry, middle_m=middle_m)
+
+
+def tapered(codes: I16, n: int, geometry: Geometry, *, middle_m: F64 | None = None) -> I16:
+    """Fade an outer panel's values to the rest value at the edges of the geometry's window, if it has one.
+
+    Args:
+        codes: Values (rows, columns[, 3]) of panel `n`'s box.
+        n: The panel. The middle panel is returned unchanged.
+        geometry: Geometry with the window.
+        middle_m: (3,) point in frame `stack` to project the window from. By default, the middle of the eyes.
+    """
+    if max(geometry.taper_px) <= 0 or n == geometry.middle:
         return codes
+    at_m = geometry.eyes_m.mean(axis=0) if middle_m is None else middle_m
+    weights = _wave_taper(geometry, geometry.rasters[n], at_m)
+    weights = weights[..., None] if codes.ndim == 3 else weights
+    even = rest_of(geometry.stack.count)
+    return np.asarray(np.rint(even + (codes - np.float32(even)) * weights), np.int16)
 
 
 def _residual(own: I16, other: I16) -> I16:

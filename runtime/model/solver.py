@@ -7,7 +7,11 @@ The algorithm is described in docs/mathematics.md. This module calls the operati
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from time import perf_counter_ns
+
+import cv2
+import numpy as np
 
 from runtime.clock import Stopwatch
 from runtime.model.base import STAGES, Prediction, Predictor
@@ -17,29 +21,48 @@ from runtime.model.cpu import CpuBackend
 from runtime.model.device import SolverBackend, SolverState
 from runtime.model.geometry import Geometry
 from runtime.model.job import Job
-from runtime.model.proposal import Proposal
+from runtime.model.proposal import Proposal, tapered
 from runtime.optics.malus import rest_code
 from runtime.optics.stack import PanelStack
+from runtime.records import I16
 
 _Done = tuple[int, int | None]  # number of steps, and how many of them earlier solutions made; None: not continued
+COARSE = ((8, 16), (4, 16), (2, 12))  # without a network: divisors of the first rasters, and steps on each
+COARSE_SIZE = 1.3  # size of these steps
+COARSE_LEAST_PX = 32  # minimum rows and columns of a raster
 REDUCTIONS = (1, 2, 3, 4)  # supported rasters, given as divisors of the display's rows and columns
 REFINED_STEPS = 8  # a solution is continued for up to this many steps in total, as many as `best` has
+IN_TURN: tuple[Places, ...] = ("rising", "middle", "falling", "middle")
 REFINING = (Step(size=0.8, places="falling"), Step(size=0.8, places="rising"))  # alternate after the model's steps
 
 
 def steps_from_even(steps: int) -> tuple[Step, ...]:
-    """Return the steps to run without a network, starting from panels at the rest value.
+    """Return the steps to run without a network, starting from panels that were solved on coarser rasters.
 
     Args:
         steps: Number of steps that the model runs when it can start from its network's proposal.
     """
-    in_turn: tuple[Places, ...] = ("rising", "middle", "falling", "middle")
-    sizes = (1.2,) * (4 * steps) + (0.8,) * (3 * steps // 2)
-    return tuple(Step(size=size, places=in_turn[n % 4]) for n, size in enumerate(sizes))
+    sizes = (1.2,) * (2 * steps) + (0.8,) * steps
+    return tuple(Step(size=size, places=IN_TURN[n % 4]) for n, size in enumerate(sizes))
+
+
+def enlarged(codes: I16, n: int, coarse: Geometry, geometry: Geometry) -> I16:
+    """Resample panel `n`'s values (rows, columns, channels) from a coarser geometry's box to another geometry's."""
+    of, box = coarse.boxes[n], geometry.boxes[n]
+    across, down = coarse.stack.width_px / geometry.stack.width_px, coarse.stack.height_px / geometry.stack.height_px
+    # Positions are from the centre of the first pixel, as in OpenCV.
+    matrix = np.array([
+        [across, 0.0, across * (box.u0 + 0.5) - of.u0 - 0.5],
+        [0.0, down, down * (box.v0 + 0.5) - of.v0 - 0.5],
+    ])  # fmt: skip
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    size = box.width_px, box.height_px
+    result = cv2.warpAffine(codes, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(result, np.int16).reshape(box.height_px, box.width_px, codes.shape[2])
 
 
 class StepPredictor(Predictor):
-    """Model that runs steps starting from a network's proposal or from panels at the rest value."""
+    """Model that runs steps starting from a network's proposal or from coarser rasters (`COARSE`)."""
 
     def __init__(
         self,
@@ -54,7 +77,7 @@ class StepPredictor(Predictor):
         """Create the model.
 
         Args:
-            proposal: Network that makes the proposal to start from. If None, all panels start at the rest value.
+            proposal: Network that proposes the panels to start from. If None, they are solved on coarser rasters.
             steps: Steps to run for a solution.
             name: Model name to show to the user.
             threads: Number of processor threads.
@@ -73,7 +96,8 @@ class StepPredictor(Predictor):
         self.steps = len(self._steps)
         self.refined_steps = max(self.steps, REFINED_STEPS)
         self._backend: SolverBackend = backend or CpuBackend()
-        self._rasters: dict[PanelStack, tuple[SolverState, LayerPool]] = {}
+        self._states: dict[PanelStack, SolverState] = {}
+        self._pools: dict[PanelStack, LayerPool] = {}
         self._slots: LayerSlots | None = None
         # The newest solution's geometry, channels and number of steps; the state still holds its panels.
         self._improved: tuple[Geometry, int, int] | None = None
@@ -105,10 +129,10 @@ class StepPredictor(Predictor):
 
     def solve(self, job: Job, watch: Stopwatch | None = None) -> Prediction:
         watch = watch or Stopwatch(*STAGES)
-        if job.stack not in self._rasters:
-            state = self._backend.state(job.stack, threads=self._threads)
-            self._rasters[job.stack] = state, LayerPool(job.stack, self._slots)
-        state, pool = self._rasters[job.stack]
+        state = self._state(job.stack)
+        if job.stack not in self._pools:
+            self._pools[job.stack] = LayerPool(job.stack, self._slots)
+        pool = self._pools[job.stack]
         buffer, rest, window = pool.take(), rest_code(job.stack.count), job.window
         done: _Done = 0, None
         if window is None:  # solve everything the eyes see, or all pixels if the network proposes whole panels
@@ -146,9 +170,12 @@ class StepPredictor(Predictor):
         resumed = job.continued and before is not None and before[1] == job.channels and geometry.is_like(before[0])
         first = before[2] if before is not None and resumed else None
         self._improved, done = None, first or 0
+        proposed: dict[int, I16] = {}
+        if not resumed:
+            proposed = self._proposed(job, geometry, watch)
         with state.begin(job, geometry, resumed=resumed):
             if not resumed:
-                self._propose(job, geometry, state, watch)
+                self._begin(proposed, geometry, state)
             watch.lap("finish")
             steps = self._steps if self._is_proposed(job) else self._steps_from_even
             while done < (len(steps) if job.steps is None else job.steps):
@@ -161,14 +188,40 @@ class StepPredictor(Predictor):
         self._improved = geometry, job.channels, done
         return done, first
 
+    def _state(self, stack: PanelStack) -> SolverState:
+        if stack not in self._states:
+            self._states[stack] = self._backend.state(stack, threads=self._threads)
+        return self._states[stack]
+
     def _is_proposed(self, job: Job) -> bool:
         """Return True if the network proposes panels for a job, which must have one view for each of two eyes."""
         return self._proposal is not None and len(job.views) == 2 * job.targets.points
 
-    def _propose(self, job: Job, geometry: Geometry, state: SolverState, watch: Stopwatch) -> None:
-        proposed = {}
+    def _proposed(self, job: Job, geometry: Geometry, watch: Stopwatch) -> dict[int, I16]:
+        """Return the panels to start from: the network's, or those solved on coarser rasters."""
         if self._proposal is not None and self._is_proposed(job):
-            proposed = self._proposal.panels(job, geometry, watch)
+            return dict(self._proposal.panels(job, geometry, watch))
+        proposed: dict[int, I16] = {}
+        solved: Geometry | None = None
+        for reduction, steps in COARSE:
+            stack = job.stack.reduced(reduction)
+            if min(stack.width_px, stack.height_px) < COARSE_LEAST_PX:
+                continue
+            targets = job.targets.on_raster(reduction)
+            coarse, state = replace(job, targets=targets, window=None), self._state(stack)
+            with state.begin(coarse, targets.visible):
+                if solved is not None:
+                    proposed = {n: enlarged(codes, n, solved, targets.visible) for n, codes in proposed.items()}
+                self._begin(proposed, targets.visible, state)
+                for n in range(steps):
+                    state.step(Step(size=COARSE_SIZE, places=IN_TURN[n % len(IN_TURN)]))
+                proposed, solved = {n: state.panel(n) for n in range(stack.count)}, targets.visible
+        watch.lap("step")
+        if solved is None:
+            return {}
+        return {n: tapered(enlarged(codes, n, solved, geometry), n, geometry) for n, codes in proposed.items()}
+
+    def _begin(self, proposed: dict[int, I16], geometry: Geometry, state: SolverState) -> None:
         for n, codes in proposed.items():
             state.set_panel(n, codes)
         if geometry.middle not in proposed:
@@ -176,6 +229,6 @@ class StepPredictor(Predictor):
         state.start()
 
     def close(self) -> None:
-        for state, _ in self._rasters.values():
+        for state in self._states.values():
             state.close()
-        self._rasters, self._improved = {}, None
+        self._states, self._pools, self._improved = {}, {}, None

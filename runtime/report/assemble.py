@@ -200,5 +200,6 @@ def _focal(page: GrowingPage) -> None:
         stack = focal.focal_stack(
             painter, full, model="best", progress=lambda done, of: page.doing(f"focal stack {done}/{of}")
         )
-    page.record["focal"] = {"model": stack.model, "cards": [asdict(card) for card in stack.cards]}
+    cards = [asdict(card) for card in stack.cards]
+    page.record["focal"] = {"model": stack.model, "cards": cards, "retina_db": stack.retina_db}
     page.put("focal", focal_section(stack))

@@ -90,6 +90,14 @@ class GlState:
             stored = np.dstack([stored, stored[..., :1]])
         self._panel("last", panel).texture.write(stored, viewport=(0, 0, box.width_px, box.height_px), alignment=1)
 
+    def panel(self, panel: int) -> I16:
+        image, components = self._panel("last", panel), self._components
+        held = self._passes.target((image,)).read(
+            viewport=(0, 0, *image.size), components=components, dtype="nu2", alignment=1
+        )
+        stored = np.frombuffer(held, np.uint16).reshape(image.height_px, image.width_px, components)
+        return np.asarray(np.rint(stored[..., : self._channels] * (3 * FULL / 65535) - FULL), np.int16)
+
     def close_middle(self) -> None:
         sets, middle = self._geometry.closing_sets(), self._geometry.middle
         table = self._texture("table", (256, 1), 2, dtype="f4", data=target_table(self._count))

@@ -1,0 +1,103 @@
+"""Pictures on the retina of an eye that focuses at a distance, and their error (docs/contracts.md, Error).
+
+The eye sees the mean of the pinhole pictures through all points of its pupil. To focus at a distance f along the gaze,
+these pictures are shifted until they coincide for points at that distance: the picture through the point (right, up) of
+the pupil is shifted by focal_px·right/f to the right and by focal_px·up/f upwards.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from runtime.optics.pupil import PUPIL_MM
+from runtime.optics.quality import psnr_db
+from runtime.optics.retina import Rays, average, pupil_points, through_layers
+from runtime.optics.stack import PanelStack
+from runtime.optics.views import image_from_stack, stack_from_eye
+from runtime.records import F32, F64, U8
+
+# Points of each pupil that get separate pictures when content is solved for focus, as (right, up) in metres
+SOLVED_POINTS_M = ((-0.00085, -0.00085), (0.00085, 0.00085))
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """Size and horizontal field of view of a retina picture."""
+
+    width_px: int
+    height_px: int
+    fov_deg: float
+
+    def projection(self, eye_m: F64, point_m: F64, *, focus_m: float) -> F64:
+        """Return the 3x4 projection matrix through a point in the pupil, refocused to a given distance.
+
+        The third homogeneous coordinate of a projected point is its distance from the eye along the gaze, in metres.
+
+        Args:
+            eye_m: The pupil's centre, shape (3,), in the `stack` frame.
+            point_m: Offset from the pupil's centre, to the right and up, shape (2,).
+            focus_m: Distance along the gaze at which the pictures through all points coincide.
+        """
+        centre = image_from_stack(eye_m, width_px=self.width_px, height_px=self.height_px, fov_deg=self.fov_deg)
+        # As the pupil's point moves, points in front of the plane in focus move the opposite way, and points behind it
+        # the same way.
+        focal_px = self.width_px / 2 / math.tan(math.radians(self.fov_deg / 2))
+        out_of_focus = centre[2] / focus_m - [0.0, 0.0, 0.0, 1.0]
+        return centre + np.outer([focal_px * point_m[0], -focal_px * point_m[1], 0.0], out_of_focus)
+
+    def through(self, matrix: F64, layers: U8, stack: PanelStack) -> F32:
+        """Return the (h, w, 3) picture of the layers as seen through a projection."""
+        u, v = (np.arange(count, dtype=np.float64) + 0.5 for count in (self.width_px, self.height_px))
+        rays = Rays(matrix, u, v[:, None])
+        panels = [stack.panel(index) for index in range(stack.count)]
+        seen = through_layers(
+            layers, lambda rows: (rays.on(panel, rows) for panel in panels), rays.toward_panels(), stack
+        )
+        return seen.image
+
+    def focused(self, eye_m: F64, picture_of: Callable[[F64], F32], *, plane_m: float) -> F32:
+        """Return the (h, w, 3) retina picture of an eye that focuses at the distance of the point (`plane_m`, 0, 0).
+
+        Args:
+            eye_m: The pupil's centre, shape (3,), in the `stack` frame.
+            picture_of: Function that returns the picture through a projection.
+            plane_m: x of the point, in the `stack` frame.
+        """
+        gaze = -stack_from_eye(eye_m)[:3, 2]
+        focus_m = float((np.array([plane_m, 0.0, 0.0]) - eye_m) @ gaze)
+        points = pupil_points(PUPIL_MM / 1e3)
+        return average(picture_of(self.projection(eye_m, point, focus_m=focus_m)) for point in points)
+
+
+def retina_db(pictures: Iterable[tuple[F32, F32]]) -> float:
+    """Return the PSNR of retina pictures against those of the scene itself.
+
+    The PSNR is of one mean squared error over all pictures: both eyes, each focused at three distances.
+
+    Args:
+        pictures: For each eye and distance, the picture seen and the scene's own, (h, w, 3) intensities.
+    """
+    total, counted = 0.0, 0
+    for seen, true in pictures:
+        error = np.asarray(seen, np.float64) - true
+        total, counted = total + float((error * error).sum()), counted + error.size
+    if not counted:
+        raise ValueError("there must be at least one retina picture")
+    return psnr_db(total / counted)
+
+
+def points_of_pupils(eyes_m: F64) -> F64:
+    """Return the points of each pupil that get separate pictures when content is solved for focus.
+
+    Args:
+        eyes_m: (V, 3) eyes in frame `stack`.
+
+    Returns:
+        (2V, 3) positions, which list all eyes for each point in turn.
+    """
+    right, up = stack_from_eye(eyes_m.mean(axis=0))[:3, 0], np.array([0.0, 0.0, 1.0])
+    return np.concatenate([eyes_m + across_m * right + up_m * up for across_m, up_m in SOLVED_POINTS_M])
