@@ -69,9 +69,8 @@ class CpuState:
         self._resting.discard(panel)
 
     def panel(self, panel: int) -> I16:
-        box, channels = self._geometry.boxes[panel], self._channels
-        held = self._held.last[panel, : box.height_px, : box.width_px * channels]
-        return held.reshape(box.height_px, box.width_px, channels).copy()
+        box = self._geometry.boxes[panel]
+        return np.array(self._held.values(panel, box.height_px, box.width_px), np.int16)
 
     def close_middle(self) -> None:
         self._resting.discard(self._geometry.middle)  # every pixel is written below
