@@ -47,7 +47,7 @@ def steps_from_even(steps: int) -> tuple[Step, ...]:
 
 
 def enlarged(codes: I16, n: int, coarse: Geometry, geometry: Geometry) -> I16:
-    """Resample panel `n`'s values (rows, columns, channels) from a coarser geometry's box to another geometry's."""
+    """Resample panel `n`'s values (rows, columns[, 3]) from a coarser geometry's box to another geometry's."""
     of, box = coarse.boxes[n], geometry.boxes[n]
     across, down = coarse.stack.width_px / geometry.stack.width_px, coarse.stack.height_px / geometry.stack.height_px
     # Positions are from the centre of the first pixel, as in OpenCV.
@@ -57,8 +57,7 @@ def enlarged(codes: I16, n: int, coarse: Geometry, geometry: Geometry) -> I16:
     ])  # fmt: skip
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     size = box.width_px, box.height_px
-    result = cv2.warpAffine(codes, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(result, np.int16).reshape(box.height_px, box.width_px, codes.shape[2])
+    return np.asarray(cv2.warpAffine(codes, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE), np.int16)
 
 
 class StepPredictor(Predictor):

@@ -229,6 +229,17 @@ def test_panels_that_begin_even_show_both_eyes_a_picture(stack: str) -> None:
     assert expected_psnrs_db(layers, pictures, STACKS[stack], **how, sigmas_mm=[0.0])[0.0] > 22
 
 
+def test_grey_pictures_for_four_views_are_solved_in_one_channel() -> None:
+    at = np.concatenate([eyes(0.6, side_m) for side_m in (-0.15, 0.15)])
+    pictures = [card_scene(eye)[..., :1].repeat(3, 2) for eye in at]
+    solver = load_predictor("fast", STACKS["four"])
+    job = Job(
+        Targets(STACKS["four"], at, captured_views(pictures, at, STACKS["four"], fov_deg=FOV_DEG)), eye_sigma_m=0.0
+    )
+    grey, colour = (solver.solve(replace(job, channels=channels)).layers.copy() for channels in (1, 3))
+    assert np.abs(grey.astype(int) - colour).mean() < 1
+
+
 def test_equal_grey_pictures_and_panels_that_show_them_stay() -> None:
     pair = eyes(0.6)
     grey = np.full((270, 480, 4), 128, np.uint8)
