@@ -4,7 +4,7 @@ import { writeFileSync } from "node:fs";
 import { opened, say } from "./chromium.mjs";
 
 const [, , file, width, height, built, folder] = process.argv;
-const { browser, page: newPage, errors } = await opened();
+const { browser, page: newPage, errors } = await opened({ width: 480, height: 640 }); // small, because software draws it
 const page = await newPage();
 await page.goto(`file://${file}`);
 await page.evaluate(() => window.phasestack.ready);
@@ -17,6 +17,5 @@ await page.evaluate(() => { document.querySelector(".built").open = true; });
 await page.waitForFunction(() => /\d dB/.test(document.querySelector(".light").textContent), null, { timeout: 300000 });
 say("told", await page.textContent(".light"));
 say("sliders", await page.evaluate(() => [...document.querySelectorAll(".built input")].map((one) => Number(one.value))));
-await page.screenshot({ path: `${folder}/page.png`, timeout: 300000 });
 say("errors", errors);
 await browser.close();
