@@ -14,6 +14,9 @@ export PIP_DISABLE_PIP_VERSION_CHECK = 1
 # pip names each package as it is downloaded, with a bar on a terminal.
 PROGRESS := --progress-bar on
 NIGHTLY := out/nightly
+SANITIZED := out/sanitized
+SANITIZERS := -fsanitize=address,undefined -fno-sanitize-recover=all
+SANITIZE_ARGS ?=
 
 .PHONY: demo test test-setup test-slow golden lint types secrets coverage nightly package bench fuzz mutate soak install uninstall system eye-models models gallery site hashes clean
 
@@ -78,6 +81,16 @@ fuzz: $(VENV)/.test
 # Change one place of a room at a time, and count the changes that its tests notice; MUTATE_ARGS="--count 100 --seed 7".
 mutate: $(VENV)/.test
 	$(BIN)/python -m tests.mutate $(ROOM) $(MUTATE_ARGS)
+
+# The kernels with AddressSanitizer and UndefinedBehaviorSanitizer, built in a copy of the sources: their tests, those of
+# what calls them, and random geometry. FUZZ_EXAMPLES=100000: a night of it; SANITIZE_ARGS="-k fuzz": only some tests.
+sanitize: $(VENV)/.test
+	rm -rf $(SANITIZED) && mkdir -p $(SANITIZED)
+	git ls-files -z --cached --others --exclude-standard | xargs -0 cp --parents -t $(SANITIZED)
+	cd $(SANITIZED) && CFLAGS="$(SANITIZERS) -g1 -DONE_LEVEL" LDFLAGS="$(SANITIZERS)" $(CURDIR)/$(BIN)/python -c "from setuptools import setup; setup()" -q build_ext --inplace
+	cd $(SANITIZED) && LD_PRELOAD="$$($(CXX) -print-file-name=libasan.so) $$($(CXX) -print-file-name=libstdc++.so)" \
+	ASAN_OPTIONS=detect_leaks=0:allocator_may_return_null=1 UBSAN_OPTIONS=print_stacktrace=1 FUZZ_EXAMPLES=$${FUZZ_EXAMPLES:-2000} \
+	$(CURDIR)/$(BIN)/python -m pytest tests/fuzz/test_kernels.py tests/model tests/panels tests/optics -m "not slow" -n $(TEST_WORKERS) --timeout 3600 $(SANITIZE_ARGS)
 
 soak: $(VENV)/.test
 	$(BIN)/python -m tests.soak
