@@ -188,6 +188,19 @@ def test_a_skin_has_the_pose_of_its_nodes(tmp_path: Path) -> None:
     assert data.low[0] == -1 and data.high[0] == pytest.approx(1 - 1 + 4)
 
 
+def test_a_skin_may_name_more_than_four_joints_per_vertex(tmp_path: Path) -> None:
+    b = Buffer()
+    primitive = square(b)
+    for number, joint in ((0, 0), (1, 1)):  # half of each vertex's weight is in the second set
+        primitive["attributes"][f"JOINTS_{number}"] = b.add([[joint, 0, 0, 0]] * 4, np.uint8)
+        primitive["attributes"][f"WEIGHTS_{number}"] = b.add([[128, 0, 0, 0]] * 4, np.uint8, normalized=True)
+    skins = [{"joints": [1, 2]}]
+    nodes = [{"mesh": 0, "skin": 0}, {"children": [2]}, {"translation": [4, 0, 0]}]
+    scenes = [{"nodes": [0, 1]}]
+    data = load_mesh(b.write(tmp_path / "a.gltf", primitive, nodes=nodes, skins=skins, scenes=scenes, materials=[{}]))
+    assert (data.low[0], data.high[0]) == (pytest.approx(-1 + 2), pytest.approx(1 + 2))
+
+
 @pytest.mark.parametrize(
     "hidden",
     [
@@ -303,6 +316,18 @@ def test_a_sampler_says_how_a_texture_goes_on(
     across = [[-1, 1], [2, 1], [2, 0], [-1, 0]]
     painted(tmp_path / "a.gltf", b, square(b, across), samplers=[{"wrapS": wrap, "wrapT": wrap, "magFilter": 9728}])
     assert columns(drawn(tmp_path / "a.gltf", context, stack)) == seen
+
+
+def test_a_texture_has_its_own_rule_for_each_direction(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    """From -1 to 2 both ways: the edge is repeated across, and the picture is repeated downwards."""
+    b = Buffer()
+    both = [[-1, 2], [2, 2], [2, -1], [-1, -1]]
+    quarters = np.array([[[255, 0, 0, 255], [0, 0, 255, 255]], [[0, 255, 0, 255], [0, 0, 255, 255]]], np.uint8)
+    samplers = [{"wrapS": 33071, "wrapT": 10497, "magFilter": 9728}]
+    picture = drawn(painted(tmp_path / "a.gltf", b, square(b, both), quarters, samplers=samplers), context, stack)
+    assert columns(picture[: stack.height_px // 2 + 10]) in ("rb", "gb")
+    left = slice(stack.width_px // 2 - 30, stack.width_px // 2 - 10)
+    assert columns(picture[:, left].transpose(1, 0, 2)[::-1]) in ("rgrgrg", "grgrgr")
 
 
 def test_a_texture_takes_the_coordinates_that_it_names(tmp_path: Path, context: Any, stack: PanelStack) -> None:
