@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from runtime.config import Settings, with_options
@@ -59,8 +59,8 @@ def test_a_point_is_found_where_the_old_middle_saw_it(
         right, down = displacement(moved, panel, relief, (480, 270), shown[None, :1], shown[None, 1:])
         matrix = aligned.solved_from_shown[panel]
         found = shown * np.diag(matrix)[:2] + matrix[:2, 2] + np.array([right.item(), down.item()])
-        if not aligned.limited:
-            np.testing.assert_allclose(found, on_panel(panel, old_m, point_m), atol=2e-3 * (1 + np.abs(shown).max()))
+        assume(not aligned.limited)
+        np.testing.assert_allclose(found, on_panel(panel, old_m, point_m), atol=2e-3 * (1 + np.abs(shown).max()))
 
 
 def test_the_relief_of_the_middle_panel_and_of_the_background_is_none() -> None:

@@ -24,8 +24,10 @@ def gl() -> Iterator[moderngl.Context]:
 
 
 @pytest.fixture
-def context(gl: moderngl.Context) -> moderngl.Context:
-    return gl
+def context(gl: moderngl.Context) -> Iterator[moderngl.Context]:
+    """The shared context, made current again."""
+    with gl:
+        yield gl
 
 
 @pytest.fixture(scope="module")
