@@ -153,7 +153,7 @@ def status(
     config: Config = None,
     as_json: Annotated[bool, typer.Option("--json", help="print the status as a JSON object")] = False,
 ) -> None:
-    """Show the daemon's state and the reason for it, what it shows, rates, quality and faults; then all figures.
+    """Show the daemon's state and its reason, the scene, rates, quality and faults; then all figures.
 
     Exits with 1 if no daemon answers, or if its loop has been hanging for five seconds.
 

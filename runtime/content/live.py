@@ -136,7 +136,7 @@ class LiveSource(ContentSource):
 
 
 def layout_for(picture: LivePicture, settings: ContentSettings) -> Layout:
-    """Return a live picture's layout: the one in the settings or, with `auto`, side by side if the halves are alike."""
+    """Return a live picture's layout, by the settings or, with `auto`, by comparing its halves."""
     layout = settings.layout
     if layout == "auto":
         layout = hint(picture.rgb) or "mono"

@@ -75,7 +75,7 @@ class _Ended(Exception):
 
 
 class PipeFeed(Feed):
-    """Feed that reads a pipe. It begins again if the writer closes the pipe, ends or sends something else."""
+    """Feed that reads a pipe, and begins again if the writer closes it or sends something else."""
 
     def __init__(self, options: PipeOptions) -> None:
         super().__init__(options.path or options.command[0])

@@ -87,7 +87,7 @@ def _source(options: WindowOptions, file: SceneFile, context: Any = None) -> Con
 
 
 def place_of(title: str, listed: str) -> Place | None:
-    """Return the place of the largest window whose title or class contains a text, or None if there is none.
+    """Return the place of the largest window whose title or class contains a text, or None.
 
     Our own panels are not found.
 

@@ -103,7 +103,7 @@ def print_summary(
 
 
 def headline_lines(summary: dict[str, Any], *, asked: int | None = None) -> Iterator[str]:
-    """Yield the lines that everybody needs: the quality, how much was shown, how it was solved, and what went wrong."""
+    """Yield the most important lines: the quality, refreshes, solutions and faults."""
     live_db, light_db, view_mm = summary["live_db"], summary["light_db"], (summary["view_error_mm"] or {}).get("p50")
     if live_db is not None:
         late = "" if view_mm is None else f"; the view lags {view_mm:.1f} mm behind the head (median)"

@@ -152,7 +152,7 @@ def library_scenes(settings: ContentSettings) -> tuple[str, ...]:
 
 
 def pictures(run: Run) -> dict[str, Any]:
-    """Return thumbnails of the latest refresh for the page, as base64-encoded JPEG files, with its time and state."""
+    """Return base64-encoded JPEG thumbnails of the latest refresh, with its time and state."""
     refresh, state = run.presenter.last, run.presenter.machine.name
     if refresh is None:
         return {"frame": None, "jpegs": {}}

@@ -273,7 +273,7 @@ def has_picture(refresh: Refresh) -> bool:
 
 
 def is_measurable(refresh: Refresh) -> bool:
-    """Return True if light can be measured at the aligned eyes: a viewer is tracked, and the content is not stale."""
+    """Return True if a viewer is tracked and the content is not stale, so that light can be measured."""
     solution = refresh.solution
     return (
         refresh.account.state is State.TRACKING
@@ -285,7 +285,7 @@ def is_measurable(refresh: Refresh) -> bool:
 
 
 def applies_to(moment: Moment, refresh: Refresh) -> bool:
-    """Return True if a measurement holds for a refresh: same content, model and placement, and the eyes at rest."""
+    """Return True if a measurement of the same content, model and eyes holds for a refresh."""
     account = moment.account
     return (
         account is not None

@@ -1,4 +1,4 @@
-"""Build the compiled loops (pyproject.toml). Adds nanobind, whose folder is known only where it is installed."""
+"""Build the compiled loops (pyproject.toml) with nanobind."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ TRIAL_HALF_M = 0.031  # half the distance between the eyes
 
 
 def trial_eyes_m(stack: PanelStack) -> F64:
-    """Return the (2, 3) eyes in frame `stack` for warm-up and timing, a usual distance in front of all panels."""
+    """Return (2, 3) eyes for warm-up and timing, a usual distance in front of all panels."""
     distance_m = max(TRIAL_M, max(stack.x_m) + TRIAL_ROOM_M)
     return np.array([[distance_m, -TRIAL_HALF_M, 0.0], [distance_m, TRIAL_HALF_M, 0.0]])
 

@@ -173,7 +173,7 @@ class ChainProposal:
 
 
 def tapered(codes: I16, n: int, geometry: Geometry, *, middle_m: F64 | None = None) -> I16:
-    """Fade an outer panel's values to the rest value at the edges of the geometry's window, if it has one.
+    """Fade an outer panel's values to the rest value at the edges of the geometry's window.
 
     Args:
         codes: Values (rows, columns[, 3]) of panel `n`'s box.

@@ -37,7 +37,7 @@ REFINING = (Step(size=0.8, places="falling"), Step(size=0.8, places="rising"))  
 
 
 def steps_from_even(steps: int) -> tuple[Step, ...]:
-    """Return the steps to run without a network, starting from panels that were solved on coarser rasters.
+    """Return the steps to run without a network, from panels that were solved on coarser rasters.
 
     Args:
         steps: Number of steps that the model runs when it can start from its network's proposal.
@@ -47,7 +47,7 @@ def steps_from_even(steps: int) -> tuple[Step, ...]:
 
 
 def enlarged(codes: I16, n: int, coarse: Geometry, geometry: Geometry) -> I16:
-    """Resample panel `n`'s values (rows, columns[, 3]) from a coarser geometry's box to another geometry's."""
+    """Resample a panel's values (rows, columns[, 3]) from a coarser geometry's box to a finer one's."""
     of, box = coarse.boxes[n], geometry.boxes[n]
     across, down = coarse.stack.width_px / geometry.stack.width_px, coarse.stack.height_px / geometry.stack.height_px
     # Positions are from the centre of the first pixel, as in OpenCV.

@@ -84,7 +84,7 @@ def is_grey(picture: U8) -> bool:
 
 
 def without_alpha(picture: U8, channels: int) -> U8:
-    """Return an (h, w, 3) picture or, if `channels` is 1, its first channel (h, w). Rows may be apart in memory."""
+    """Return an (h, w, 3) picture or, if `channels` is 1, its first channel (h, w)."""
     if channels == 1:
         return np.asarray(cv2.extractChannel(picture, 0), np.uint8)
     return picture if picture.shape[2] == 3 else np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGBA2RGB), np.uint8)

@@ -1,4 +1,4 @@
-"""Pictures on the retina of an eye that focuses at a distance, and their error (docs/contracts.md, Error).
+"""Retina pictures of an eye that focuses at a distance, and their error (docs/contracts.md).
 
 The eye sees the mean of the pinhole pictures through all points of its pupil. To focus at a distance f along the gaze,
 these pictures are shifted until they coincide for points at that distance: the picture through the point (right, up) of
@@ -60,7 +60,7 @@ class Camera:
         return seen.image
 
     def focused(self, eye_m: F64, picture_of: Callable[[F64], F32], *, plane_m: float) -> F32:
-        """Return the (h, w, 3) retina picture of an eye that focuses at the distance of the point (`plane_m`, 0, 0).
+        """Return the (h, w, 3) retina picture of an eye that focuses on the point (`plane_m`, 0, 0).
 
         Args:
             eye_m: The pupil's centre, shape (3,), in the `stack` frame.

@@ -74,7 +74,7 @@ class Interpolation(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mount:
-    """Position of a layer on its monitor (registration, rotation, mirroring), and the monitor's grey curve."""
+    """Position of a layer on its monitor, and the monitor's grey curve."""
 
     screen_px: tuple[int, int]  # width and height
     layer_from_screen: F64  # 3x3 homography of pixels; the third coordinate is positive at the monitor's centre
@@ -127,7 +127,7 @@ class PanelDraw:
 
 
 def flatness_of(frame: PanelFrame) -> float:
-    """Return the flat picture's weight. If it is 1, the solution is not shown; if it is 0, the flat picture is not."""
+    """Return the flat picture's weight: 0 shows only the solution, 1 only the flat picture."""
     return 1.0 if frame.solved is None else min(max(frame.flatness, 0.0), 1.0)
 
 
@@ -192,7 +192,7 @@ def _moves(
 
 
 def shown_layers(frame: PanelFrame) -> U8:
-    """Return a frame's (N, h, w, 4) layers as the panels show them, before curves, rotation and mirroring.
+    """Return a frame's (N, h, w, 4) layers as shown, before curves, rotation and mirroring.
 
     If the frame's solution or flat picture is shown as it is, that array is returned without a copy.
 

@@ -1,4 +1,4 @@
-"""Values of pictures at positions in their pixels, which count from the corner and are moved into the picture."""
+"""Sample pictures at pixel positions, which count from the corner and are clamped to the picture."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Geometry of the panel stack: planes parallel to the panels, pixel grids on them, and maps between these.
+"""Geometry of the panel stack: planes parallel to the panels, pixel grids, and maps between them.
 
 Pixel positions (u, v) are continuous, with pixel centres at half-integers. OpenCV counts from the first pixel's centre;
 `between_pixel_centres` is the only place that converts between the two.
@@ -82,7 +82,7 @@ class PlaneRaster:
         return np.asarray(other.raster_from_plane() @ self.plane.to(other.plane, eye_m) @ self.plane_from_raster())
 
     def to_and_back(self, via: Plane, *, old_m: Sequence[float], step_m: Sequence[float]) -> F64:
-        """Return the 3x3 scale and shift that project pixels onto a plane from one eye, and back from another.
+        """Return the 3x3 map that projects pixels onto a plane from one eye, and back from another.
 
         The first eye is at old_m + step_m, the second at old_m. The result is exactly the identity if the step is zero
         or the plane is the raster's. `optics.alignment` derives the equation. Plain floats are several times as fast

@@ -47,7 +47,7 @@ QUOTED = "1"  # the `light_db` key of the figure to quote, at a tracking error o
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """A method of computing layers: a network, SART as an iterative reference, or another solver's stored layers."""
+    """A method of computing layers: a network, SART, or another solver's stored layers."""
 
     name: str
     kind: Kind
@@ -87,7 +87,7 @@ def given_layers(folder: Path, cases: Sequence[StillPair]) -> Method:
 
 
 def stored_run(method: Method, pair: StillPair) -> MethodRun:
-    """Read another solver's layers and time for a pair. Raises InputError if they are missing or unusable."""
+    """Read another solver's layers and time for a pair. Raises InputError if they are unusable."""
     folder = Path(method.source)
     times = read_table(folder / TIMES)
     time_ms = times.get(pair.name)

@@ -1,4 +1,4 @@
-"""Colours declared by code (ITU-T H.273): ICC profiles for AVIF and HEIC pictures (`nclx`), and sRGB for films."""
+"""Colours declared by code (ITU-T H.273): ICC profiles for pictures, and sRGB for films."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def _hlg(code: F64) -> F64:
 
 
 def srgb_from(rgb: U8, *, primaries: int, transfer: int) -> U8:
-    """Convert a picture (h, w, 3) with PQ or HLG codes to sRGB. Light brighter than paper white is clipped."""
+    """Convert an (h, w, 3) picture from PQ or HLG to sRGB, clipped at paper white."""
     code = np.linspace(0.0, 1.0, 256)
     light = _pq(code) if transfer == PQ else _hlg(code) / _hlg(np.array(0.75))
     own, srgb = (np.array(PRIMARIES.get(number, PRIMARIES[1])).T for number in (primaries, 1))

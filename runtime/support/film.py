@@ -193,7 +193,7 @@ class Film:
                 yield from ((index, one) for one in _filtered(graphs.pop(index, None), None))
 
     def rgb(self, frames: tuple[av.VideoFrame, ...], *, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> U8:
-        """Convert frames to a picture (h, w, 3), upright and over a background. Two views are joined side by side."""
+        """Convert frames to an upright (h, w, 3) picture over a background, with two views side by side."""
         views = [_rgb(frame, background) for frame in frames]
         return views[0] if len(views) == 1 else np.concatenate(views, axis=1)
 

@@ -91,7 +91,7 @@ def test_raw_rgb_needs_its_size(fifo: Path) -> None:
     source.close()
 
 
-def test_a_closed_pipe_is_told_and_comes_back_by_itself_in_another_size(fifo: Path) -> None:
+def test_a_closed_pipe_is_told_and_comes_back_in_another_size(fifo: Path) -> None:
     source = opened(path=str(fifo))
     with fifo.open("wb") as writer:
         writer.write(y4m((50,)))

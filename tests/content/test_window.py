@@ -105,7 +105,7 @@ def test_a_picture_that_does_not_change_is_not_solved_again(display: str) -> Non
 
 
 @needs_x
-def test_a_command_has_a_screen_of_its_own_and_ends_with_the_scene(tmp_path: Path) -> None:
+def test_a_command_has_its_own_screen_and_ends_with_the_scene(tmp_path: Path) -> None:
     told = str(tmp_path / "pid")
     script = f"import os; open({told!r}, 'w').write(str(os.getpid()))\n" + SHOWS_HALVES
     command = [sys.executable, "-c", script, "any", "200x100+0+0", "#00ffff", "#ff00ff"]

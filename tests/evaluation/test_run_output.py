@@ -122,7 +122,7 @@ def test_a_full_disk_keeps_what_was_complete_and_the_run_goes_on(
     assert json.loads((tmp_path / "summary.json").read_text()) == SUMMARY
 
 
-def test_pictures_that_the_disk_had_no_room_for_are_not_left_in_part(
+def test_pictures_without_room_on_the_disk_are_not_left_in_part(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     real, room = run_output.write_png, iter(range(7))

@@ -157,7 +157,7 @@ def test_a_face_on_the_wall_gives_way_to_a_person_who_moves() -> None:
     assert set(seen[-25:]) == {"person"}
 
 
-def test_a_person_who_moves_is_kept_and_so_is_one_who_sits_still_alone_or_among_pictures() -> None:
+def test_a_person_who_moves_or_sits_still_alone_is_kept() -> None:
     assert set(whose(wall_moves=True, person_moves=True)) == {"wall"}
     assert set(whose(wall_moves=False, person_moves=False)) == {"wall"}
 

@@ -118,7 +118,7 @@ def test_quantiles_cover_the_whole_run_and_remember_an_early_stall() -> None:
     assert figures.of("p99")["p99"] == pytest.approx(9900, rel=0.02)
 
 
-def test_missed_blanks_are_the_displays_total_and_skew_is_that_of_shown_refreshes() -> None:
+def test_missed_blanks_are_a_total_and_skew_is_of_shown_refreshes() -> None:
     stats = RunStats()
     for number, missed in enumerate([0, 3, 5]):
         stats.add(account(number, skew_ms=float(number), presented=number < 2), overhead_ms=0.1, missed_blanks=missed)

@@ -168,7 +168,7 @@ def test_the_middle_panel_closes_on_one_eye_s_target(stack: str) -> None:
     assert off.max() <= 32  # of rays that miss a panel, which weigh little in 16 bits
 
 
-def test_a_ray_that_misses_a_panel_leaves_a_pixel_to_the_other_eye() -> None:
+def test_a_ray_that_misses_a_panel_leaves_it_to_another() -> None:
     state, job, geometry = begun(STACK, eyes(0.3), own=False)
     for n, box in enumerate(geometry.boxes):
         state.set_panel(n, np.full((box.height_px, box.width_px, 3), rest_of(3), np.int16))

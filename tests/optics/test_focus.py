@@ -62,7 +62,7 @@ def test_without_pictures_there_is_no_error() -> None:
         retina_db([])
 
 
-def test_an_edge_on_the_plane_in_focus_is_sharp_and_elsewhere_blurred_by_the_optical_disc() -> None:
+def test_an_edge_is_sharp_in_focus_and_blurred_elsewhere() -> None:
     """A black and white edge at x = 0, drawn for each point of the pupil, spreads over the disc's width."""
     wide = Camera(1440, 4, 18.0)
 

@@ -75,7 +75,7 @@ def test_an_image_whose_pixels_are_the_panels_own_needs_no_warp() -> None:
     assert np.array_equal(panel_from_image(from_above, raster), np.eye(3))
 
 
-def test_an_eye_a_picometre_before_a_panel_still_has_a_view_of_it() -> None:
+def test_an_eye_a_picometre_before_a_panel_has_a_view() -> None:
     stack, random = PanelStack(0.5, 0.3, (-0.06, 0.0, 0.06), 1920, 1080), np.random.default_rng(2)
     for y_m, z_m in random.uniform(-1.0, 1.0, (50, 2)):
         panel_from_image(image_from_stack([0.06 + 1e-12, y_m, z_m], **IMAGE), stack.panel(2))
