@@ -25,7 +25,7 @@ SOLVED_POINTS_M = ((-0.00085, -0.00085), (0.00085, 0.00085))
 
 
 @dataclass(frozen=True, slots=True)
-class Camera:
+class FocusCamera:
     """Size and horizontal field of view of a retina picture."""
 
     width_px: int

@@ -14,14 +14,14 @@ from runtime.content.scenes import Scene, Thing
 from runtime.model.job import Job, Targets, drawn_views
 from runtime.model.predictor import load_predictor
 from runtime.optics.carried import intensities
-from runtime.optics.focus import Camera, points_of_pupils, retina_db
+from runtime.optics.focus import FocusCamera, points_of_pupils, retina_db
 from runtime.optics.pupil import PUPIL_MM
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import raster_from_stack
 from runtime.records import F32, F64, U8
 from runtime.report.pairs import PairPainter, eyes_at
 
-CAMERA = Camera(720, 300, 18.0)
+CAMERA = FocusCamera(720, 300, 18.0)
 PUPIL_M = PUPIL_MM / 1e3
 DISTANCE_M = 0.4
 CARDS_M = (-0.05, 0.0, 0.045)  # x of the three cards, frame `stack`

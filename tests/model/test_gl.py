@@ -306,7 +306,7 @@ def test_nothing_grows_while_a_viewer_walks(gl: GlBackend) -> None:
     places = [eyes(0.5 + 0.01 * step, 0.02 * step, roll_deg=2.0 * step) for step in range(8)]
     for pair in places:
         layers_of(opengl, cards(pair, STACK), pair, sigma_mm=3.0)
-    (state, _), *_ = opengl._rasters.values()
+    state, *_ = opengl._states.values()
     assert isinstance(state, GlState)
     held = len(state._textures)
     targets = len(gl.passes._targets)

@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.optics.focus import Camera, points_of_pupils, retina_db
+from runtime.optics.focus import FocusCamera, points_of_pupils, retina_db
 from runtime.optics.pupil import PUPIL_MM
 from runtime.optics.retina import pupil_points
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack, stack_from_eye
 from runtime.records import F64
 
-CAMERA, PUPIL_M = Camera(72, 30, 18.0), PUPIL_MM / 1e3
+CAMERA, PUPIL_M = FocusCamera(72, 30, 18.0), PUPIL_MM / 1e3
 EYES = np.array([[0.4, -0.0315, 0.0], [0.4, 0.0315, 0.0]])
 EYE = EYES[1]
 
@@ -64,7 +64,7 @@ def test_without_pictures_there_is_no_error() -> None:
 
 def test_an_edge_is_sharp_in_focus_and_blurred_elsewhere() -> None:
     """A black and white edge at x = 0, drawn for each point of the pupil, spreads over the disc's width."""
-    wide = Camera(1440, 4, 18.0)
+    wide = FocusCamera(1440, 4, 18.0)
 
     def edge(matrix: F64) -> np.ndarray:
         at = matrix @ [0.0, 0.0, 0.0, 1.0]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from model_export.scene import Plane, draw
+from model_export.scene import Parallelogram, draw
 from runtime.evaluation.displayed import displayed
 from runtime.model.still import solve_still
 from runtime.optics.views import image_from_stack
@@ -24,7 +24,7 @@ def test_what_lies_behind_the_eye_is_not_seen() -> None:
     red = np.zeros((8, 8, 4), np.uint8)
     red[...] = (255, 0, 0, 255)
     # A wall next to the eye, from far in front of it to as far behind it.
-    wall = Plane(red, np.array([-2.0, 0.3, 0.5]), np.array([4.0, 0.0, 0.0]), np.array([0.0, 0.0, -1.0]))
+    wall = Parallelogram(red, np.array([-2.0, 0.3, 0.5]), np.array([4.0, 0.0, 0.0]), np.array([0.0, 0.0, -1.0]))
     size = {"width_px": 64, "height_px": 36}
     image = draw((wall,), image_from_stack(np.array([0.6, 0.0, 0.0]), **size, fov_deg=90.0), **size)
     assert (image[18, 50:, 0] > 200).all() and (image[18, :32] == 0).all()
