@@ -201,8 +201,6 @@ def _solved(problem: _Problem, state: _State, used: NDArray[np.bool_], *, robust
     """Minimise the residuals of the `used` points with the Levenberg-Marquardt method.
 
     Args:
-        problem: Problem to solve.
-        state: Initial state.
         used: Mask (K,) of the points to fit.
         robust: Minimise the soft L1 norm, by iterative reweighting, rather than the sum of squares.
     """

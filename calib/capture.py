@@ -89,7 +89,6 @@ class Walk:
         Args:
             file: File that stores the accepted pairs.
             viewpoints: Viewpoints, in the order they are to be visited.
-            say: Function that shows a line of text to the user.
             chart: Function that shows a viewpoint's chart, or None if the charts are shown by other means.
         """
         self._file, self._say, self._chart = file, say, chart
@@ -189,13 +188,8 @@ def capture_live(
 
     Args:
         out: CSV file for the pairs. If it exists, pairs are added to it.
-        settings: Display and sensor configuration.
         hardware: Real or simulated hardware.
         show: Show the charts on the panels.
-        say: Function that shows a line of text to the user.
-
-    Returns:
-        A summary of the run, for the command to report.
 
     Raises:
         InputError: The file is invalid or cannot be written, or the sensor or the panels cannot be opened.
@@ -224,11 +218,7 @@ def capture_recording(out: Path, settings: Settings, *, source: str) -> dict[str
 
     Args:
         out: CSV file for the pairs. If it exists, pairs are added to it.
-        settings: Sensor configuration.
         source: Path of the recording, or `demo` for the built-in recording.
-
-    Returns:
-        A summary of the run, for the command to report.
 
     Raises:
         InputError: No sample has both the true eye positions and confidently measured eyes.

@@ -79,12 +79,7 @@ def make_charts(out: Path, viewpoints: Sequence[Viewpoint], settings: Settings) 
     """Write every chart's layers as PNG files, together with `charts.json`.
 
     Args:
-        out: Folder to write to.
         viewpoints: Viewpoints that need a chart.
-        settings: Display and model configuration.
-
-    Returns:
-        A summary of the run, for the command to report.
 
     Raises:
         InputError: A file cannot be written, or the model cannot be loaded for this stack.

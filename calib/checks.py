@@ -57,8 +57,6 @@ def check_solution(pairs: Pairs, solution: CalibrationSolution, volume_m: F64) -
     """Check a solution and return warnings.
 
     Args:
-        pairs: Pairs used to compute the calibration.
-        solution: Calibration to check.
         volume_m: Points (..., 3) in the `stack` frame that span the viewers' range of movement.
 
     Raises:

@@ -50,7 +50,6 @@ def open_display(settings: Settings, *, registered: bool = False, grey_curve: bo
     """Open the configured panels.
 
     Args:
-        settings: Display configuration.
         registered: Apply the registration, that is, each panel's homography.
         grey_curve: Apply each panel's gamma or LUT.
 

@@ -134,13 +134,8 @@ def lut_from_photographs(
     Args:
         out: CSV file to write the LUT to.
         pictures: The photographs' names and grey pixels (h, w).
-        stack: Panel geometry.
-        panel: Panel index.
         source: Origin of the photographs, used in error messages.
         turns: The panel's angles at black and full white, 0 and 90 degrees by default.
-
-    Returns:
-        A summary of the run, for the command to report.
 
     Raises:
         InputError: A photograph is unusable, or the measured greys do not increase.
@@ -171,7 +166,6 @@ def histograms(picture: U8, stack: PanelStack, panel: int, *, source: str) -> F6
 
     Args:
         picture: Grey photograph (h, w) of a chart.
-        stack: Panel geometry.
         panel: Index of the panel that shows the chart.
         source: Name of the photograph, used in error messages.
 
@@ -213,7 +207,6 @@ def measure(pictures: list[F64], stack: PanelStack, panel: int, *, source: str) 
 
     Args:
         pictures: Each photograph's patch histograms (P, 256).
-        stack: Panel geometry.
         panel: Index of the panel that shows the chart.
         source: Origin of the photographs, used in error messages.
 

@@ -102,12 +102,10 @@ class SetupHardware:
         """Show pictures on the panels without registration, wait for the user's photographs and return them.
 
         Args:
-            settings: Display configuration.
             pictures: (N, H, W) grey pictures, one per panel: the boards, or the grey chart on one panel and nothing on
                 the others.
             panel: Index of the panel that shows the grey chart, with no grey curve applied, or None if the boards are
                 shown.
-            say: Function that shows a line of text to the user.
 
         Raises:
             InputError: The user stopped, or the folder has no readable photographs.

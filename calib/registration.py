@@ -94,7 +94,6 @@ def register_photographs(seen: Sequence[SeenMarks], stack: PanelStack, *, eye_m:
 
     Args:
         seen: Marks found in each photograph.
-        stack: Configured geometry.
         eye_m: Viewing position (3,) that the panels are registered for, in the `stack` frame.
 
     Raises:
@@ -198,11 +197,7 @@ def register_photos(
         pictures: The photographs' names and grey pixels (h, w).
         source: Origin of the photographs, used in error messages.
         out: Folder for `registration.json`.
-        settings: Display configuration.
         config: Configuration file to update with the registration, or None.
-
-    Returns:
-        A summary of the run, for the command to report.
 
     Raises:
         InputError: The photographs do not determine the panels' poses, `config` describes a different number of panels

@@ -51,7 +51,6 @@ def write_report(file: Path, out: Path, *, viewing: CalibrationSettings) -> dict
 
     Args:
         file: Calibration file.
-        out: Folder to write to.
         viewing: Viewing range settings. The error at the eye is averaged over this range.
 
     Returns:

@@ -52,7 +52,6 @@ def run_setup(
         out: Folder for reports and for the files that the configuration uses.
         photos: Folder where the user puts photographs.
         simulate: Simulate the monitors, the panels and the sensor.
-        seed: Simulation seed.
         to_stderr: Write all messages to stderr instead of stdout.
 
     Returns:

@@ -119,7 +119,6 @@ def solve(
     Args:
         sensor_m: Measured points (K, 3) in the `sensor` frame.
         stack_m: Known points (K, 3) in the `stack` frame.
-        method: Method to use.
         known_scale: Scale for the `fixed-scale` method.
         reason: Reason for choosing the method, stored with the result.
 

@@ -34,12 +34,8 @@ def solve_file(
     Args:
         pairs_path: CSV or JSON file with the pairs.
         out: Calibration file to write. The version it replaces is kept.
-        settings: Sensor, panel and viewing range configuration.
         method: Method name. If empty, the method with the least expected error at the eye is chosen.
         known_scale: Scale for the `fixed-scale` method.
-
-    Returns:
-        A summary of the run with every method's figures, for the command to report.
 
     Raises:
         InputError: The pairs cannot be read or do not determine the calibration, or the method is unknown.
@@ -96,9 +92,7 @@ def calibration_text(
     """Format a solution as a calibration file for `runtime.eyes.calibration`.
 
     Args:
-        solution: Calibration to write.
         pairs: Pairs used to compute the calibration. They are stored in the `[data]` table for the report.
-        settings: Sensor and panel configuration.
         warnings: Warnings to store.
         volume_m: Points (..., 3) in the `stack` frame. The error at the eye is averaged over them.
 

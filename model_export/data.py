@@ -96,7 +96,6 @@ def random_pair(
     """Draw a random scene as seen from random eye positions.
 
     Args:
-        random: Source of all random numbers.
         width_px: Width of the pictures and of any random panels.
         height_px: Height of the pictures and of any random panels.
         stack: Panel geometry, or None for random panels.

@@ -171,8 +171,6 @@ def picture_file(
     Args:
         network: Network to export.
         origin: SHA-256 that identifies the weights, stored in the contract.
-        width_px: Picture width.
-        height_px: Picture height.
         eye_order: Order of the eyes in the input, stored in the contract.
 
     Raises:

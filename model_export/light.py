@@ -86,10 +86,7 @@ class Views:
         """Create the rays through the pixels of either the eyes' pictures or the middle panel.
 
         Args:
-            stack: Panel geometry.
             eyes_m: Left and right eye positions (2, 3) in the `stack` frame.
-            width_px: Raster width.
-            height_px: Raster height.
             fov_deg: The pictures' horizontal field of view, or None for the middle panel's raster.
             places_m: Displacements (P, 3) of both eyes. Each displacement adds two sets of rays, which pass through the
                 same points on the middle panel.
@@ -133,7 +130,6 @@ def traced(
         views: The eyes' rays.
         rays: Number of rays across and down a pixel. The pixel is divided into rays² equal parts, and each ray is at a
             random position in one part.
-        random: Source of random positions.
 
     Returns:
         The intensities (E, C, h, w), and a mask (E, 1, h, w) of the pixels whose rays all cross all panels.
@@ -163,7 +159,6 @@ def light_db(
         targets: Target intensities (E, C, h, w).
         views: The eyes' rays.
         rays: Number of rays across and down a pixel in each of the two estimates.
-        random: Source of random positions.
     """
     (a, in_a), (b, in_b) = (traced(panels, views, rays=rays, random=random) for _ in range(2))
     counts = in_a & in_b

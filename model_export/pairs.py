@@ -179,7 +179,6 @@ def _warped(picture: U8, picture_from_raster: F64, stack: PanelStack, border: in
     Args:
         picture: Picture (h, w, 3).
         picture_from_raster: Homography from panel pixels to picture pixels.
-        stack: Panel geometry.
         border: OpenCV's border mode for pixels outside the picture.
     """
     matrix = between_pixel_centres(picture_from_raster)

@@ -41,8 +41,6 @@ def draw(scene: Scene, projection: F64, *, width_px: int, height_px: int) -> U8:
     Args:
         scene: Planes, in the order they are drawn.
         projection: 3x4 projection from homogeneous metres in the `stack` frame to homogeneous pixels.
-        width_px: Picture width.
-        height_px: Picture height.
     """
     width, height = width_px * FINER, height_px * FINER
     picture = np.zeros((height, width, 3), np.float32)
@@ -161,7 +159,6 @@ def _texture(random: Random, width: int, height: int, tones: U8, *, see_through:
     The texture is either noise whose power decreases with frequency, or a collage of discs and boxes.
 
     Args:
-        random: Source of all random numbers.
         width: Texture width.
         height: Texture height.
         tones: Lookup table (256,) applied to all colours.

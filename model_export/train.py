@@ -73,9 +73,6 @@ def run_training(out: Path, training: Training, *, device: Device = "auto", resu
         device: Device to train on. `auto` selects a GPU if torch finds one.
         resume: Continue from the checkpoint in `out`.
 
-    Returns:
-        A summary of the run, for the command to report.
-
     Raises:
         InputError: The network, the data or the checkpoint is invalid, or the loss is not finite.
     """

@@ -103,7 +103,6 @@ def eye_camera(eye: EyeRequest, placed: F64) -> EyeCamera:
     right also if the scene is flattened. Everything else is in its projection.
 
     Args:
-        eye: The request for the eye.
         placed: The map from `stack_from_scene`.
     """
     inverse = np.linalg.inv(placed)

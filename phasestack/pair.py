@@ -232,7 +232,6 @@ def solve(
             must be taken by a pinhole camera at the eye that looks at the stack's origin without roll. If `right` is
             omitted, a sequence of such pictures, all of the same size.
         right: Picture for the right eye, of the same size.
-        stack: Panel geometry.
         eyes_m: Positions (V, 3) of the V pictures' eyes in metres, in the `stack` frame (+x out of the screen, +y to
             the viewer's right, +z up). Required unless `cameras` is given.
         fov_deg: The pictures' horizontal field of view, in degrees.
@@ -294,7 +293,6 @@ def solve_each(
     Args:
         pairs: Tuples (left picture, right picture, eyes_m) as in `solve`. Each pair is read only when its turn comes,
             so `pairs` may be a generator.
-        stack: Panel geometry.
         fov_deg: All pictures' horizontal field of view, in degrees.
         model: Model as in `solve`.
         eye_sigma_mm: Tracking error to allow for, as in `solve`.
@@ -346,7 +344,6 @@ def evaluate(
             angles along a ray. Floats are rounded to a panel's 8 bits.
         left: Picture that the left eye should see or, if `right` is omitted, all eyes' pictures, as in `solve`.
         right: Picture that the right eye should see, as in `solve`.
-        stack: Panel geometry.
         eyes_m: Eye positions, as in `solve`.
         fov_deg: The pictures' horizontal field of view, in degrees.
         cameras: The pictures' cameras, as in `solve`.
@@ -431,8 +428,6 @@ def camera(eye_m: Sequence[float] | F64, *, width_px: int, height_px: int, fov_d
 
     Args:
         eye_m: The eye's position in metres, in the `stack` frame.
-        width_px: Picture width.
-        height_px: Picture height.
         fov_deg: Horizontal field of view, in degrees.
 
     Raises:
@@ -456,8 +451,6 @@ def project(
     Args:
         points_m: Points (..., 3) in metres, in the `stack` frame.
         eye_m: The eye's position in metres, in the `stack` frame.
-        width_px: Picture width.
-        height_px: Picture height.
         fov_deg: Horizontal field of view, in degrees.
 
     Returns:

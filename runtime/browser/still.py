@@ -60,7 +60,6 @@ def viewer_html(
         layers: Layers, rear to front, shape (N, h, w, 3 or 4).
         wanted: Each eye's target picture (h, w, 3), compressed so that it fits into the rest of the page. If empty, the
             page has no target pictures.
-        stack: The display's panels.
         eyes_m: Eyes that the layers were solved for, shape (2, 3), in the `stack` frame.
         fov_deg: The target pictures' horizontal field of view.
         text: The page's title, followed by lines of text to show below the controls.

@@ -75,7 +75,6 @@ def look_at_files(
 
     Args:
         files: Pictures, films or recordings, in the same order as the rows.
-        settings: Settings for the eye finder.
         sequence: True to follow the viewer from one still picture to the next.
         rate_hz: Frame rate of still pictures.
         out: Folder for overlays, which show the eyes found. If None, no overlays are drawn.
@@ -192,7 +191,6 @@ def look_at_sensor(
     """Find the eyes in a sensor's frames until the time is up, a recording ends or Ctrl-C is pressed.
 
     Args:
-        settings: Settings for the sensor and the eye finder.
         report: Function called with each frame's row.
         out: Folder for the latest overlay. If None, no overlays are drawn.
         seconds: Time limit in seconds.

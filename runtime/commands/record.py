@@ -123,7 +123,6 @@ def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | N
 
     Args:
         out: File to write.
-        settings: Settings for the sensor and the eye finder.
         images: True to record colour and depth pictures too.
         seconds: How long to record, in seconds. None means ten minutes.
 

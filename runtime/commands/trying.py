@@ -50,7 +50,6 @@ def try_display(settings: Settings, *, port: int, opens: bool, seconds: float | 
     """Serve the page and run the daemon until it is stopped.
 
     Args:
-        settings: Settings, from `settings_of`.
         port: Port to listen on. 0 picks a free one.
         opens: True to open the page in a browser if there is a graphical session.
         seconds: Time limit in seconds, or None for no limit.

@@ -66,7 +66,6 @@ class ContentSource(ABC):
         Args:
             options: Instance of `Options`.
             stack: The display's panels (`PanelStack`).
-            context: Current moderngl context.
 
         Raises:
             InputError: The scene cannot be shown.

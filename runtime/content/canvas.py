@@ -131,7 +131,6 @@ class CanvasSource(ContentSource):
         """Create the source.
 
         Args:
-            context: Current moderngl context.
             info: Scene properties.
             samples: Number of samples per pixel, or 0 for no multisampling.
             deep: Draw in half floats, for blending many layers when some are brighter than white.

@@ -80,7 +80,6 @@ class PictureFiles(Frames):
 
         Args:
             paths: Picture files, in order.
-            settings: Content settings.
             folder: Folder that contains the pictures, or None for a single file. Films in a folder, files with headers
                 that cannot be read, and pictures at the start that cannot be decoded are skipped and logged.
 
@@ -156,7 +155,6 @@ class Video(Frames):
 
         Args:
             path: Film file.
-            settings: Content settings.
             times_ns: The frames' times, if they are known; see `Film`.
 
         Raises:

@@ -97,8 +97,6 @@ class OutlineRamps:
         Args:
             seen: The parts in the order in which to return their ramps. For each, its number, the eye (3,) in the
                 part's frame, and its 4x4 clip matrix. The parts' normals must point outwards.
-            width_px: Raster width.
-            height_px: Raster height.
             ramp_px: Ramp width in pixels.
 
         Returns:

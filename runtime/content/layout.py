@@ -112,7 +112,6 @@ def layout_of(path: Path, settings: ContentSettings, *, stated: str = "") -> Lay
 
     Args:
         path: File or folder. Its name may state the layout.
-        settings: Content settings.
         stated: Layout declared by the file's header, in the syntax of `content.layout`, or an empty string.
 
     Raises:

@@ -128,7 +128,6 @@ def folder_reader(path: Path, field: str) -> Callable[[str], bytes]:
     to a file in the folder of the mesh or below, or if the file cannot be read.
 
     Args:
-        path: Mesh file.
         field: Kind of reference, for error messages.
     """
     read_files: dict[str, bytes] = {}

@@ -85,7 +85,6 @@ def read_mesh(path: Path, data: bytes, read: Read, origin: Origin) -> tuple[list
     """Convert a mesh file's triangles to parts, and its points or lines to coloured points.
 
     Args:
-        path: Mesh file.
         data: The file's contents.
         read: Function that reads other files the mesh refers to.
         origin: Origin of the parts and points.
@@ -185,7 +184,6 @@ def _part(mesh: Any, matrix: F64, path: Path, pictures: dict[int, U8], origin: O
     Args:
         mesh: Mesh loaded by trimesh.
         matrix: Matrix (4, 4) from the mesh's frame to the scene's.
-        path: Mesh file.
         pictures: Textures converted so far, keyed by the `id` of their material. The dict is updated.
         origin: Origin of the part.
 

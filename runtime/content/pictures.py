@@ -20,9 +20,6 @@ def screen(stack: PanelStack, *, width_px: int, height_px: int, pixel_aspect: fl
     """Return a picture's pixel grid on the plane x = 0, enlarged or reduced to fit the display.
 
     Args:
-        stack: The display's panels.
-        width_px: Picture width.
-        height_px: Picture height.
         pixel_aspect: Pixel width divided by pixel height.
     """
     pitch_m = min(stack.width_m / (width_px * pixel_aspect), stack.height_m / height_px)

@@ -137,7 +137,6 @@ def fitted(low: F64, high: F64, *, axes: F64, stack: PanelStack, depth_m: tuple[
         low: Lowest corner (3,) of the box, in the scene's frame.
         high: Highest corner (3,) of the box, in the scene's frame.
         axes: The scene_from_stack rotation (3, 3).
-        stack: The display's panels.
         depth_m: Range of x (rear, front) to place content in.
     """
     size = np.abs(axes.T @ (high - low))

@@ -65,7 +65,6 @@ def read_playlist(path: Path, settings: ContentSettings) -> Playlist:
     """Read a playlist file.
 
     Args:
-        path: Playlist file.
         settings: Default settings for all entries, except for the placement, which applies to the playlist as a whole.
 
     Raises:
@@ -103,7 +102,6 @@ class PlaylistSource(ForwardingSource):
         Args:
             playlist: Playlist to show.
             openers: For each entry, a function that creates its source, given `context`.
-            context: Current moderngl context.
 
         Raises:
             InputError: An entry cannot be shown.

@@ -57,7 +57,6 @@ class ProceduralSource(TriangleSource):
         Args:
             built_in: Scene or scene name.
             stack: The display's panels. The scene is scaled to their height.
-            context: Current moderngl context.
             background: Background colour, by default the scene's.
             parts: Parts that `parts_of` returned for the scene, if they were prepared on another thread.
         """

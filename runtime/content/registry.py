@@ -55,8 +55,6 @@ def open_content(settings: ContentSettings, stack: PanelStack, context: Any) -> 
     """Open the scene specified by the settings: a built-in scene, a preset, a class, a file or a folder.
 
     Args:
-        settings: Content settings.
-        stack: The display's panels.
         context: Current moderngl context on the thread that will use the source.
 
     Raises:

@@ -182,7 +182,6 @@ class DrawnPart:
         """Create the part's GL objects.
 
         Args:
-            context: Current moderngl context.
             surface_program: Shader program for the triangles, owned by the source.
             outline: Vertex array for outlines, owned by the source.
             textures: The part's textures, owned by the source.
@@ -269,7 +268,6 @@ class TriangleSource(CanvasSource):
         Args:
             parts: Parts to draw.
             stack_from_parts: Each part's placement, a 4x4 similarity.
-            context: Current moderngl context.
             info: Scene properties.
             samples: Samples per pixel. If 0, outlines are smoothed with ramps instead of multisampling, which is faster
                 on a software rasteriser.

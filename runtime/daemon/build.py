@@ -147,7 +147,6 @@ def build_run(
     """Build a run that is ready for its first refresh.
 
     Args:
-        settings: The run's settings.
         options: Options that can be set only on the command line.
         cleanup: Stack that, when closed, closes all of the run's parts.
         host: Callbacks used during startup and, as the presenter's supervisor, at each refresh. None for no callbacks.
@@ -263,8 +262,6 @@ def start_solver(
 
     Args:
         settings: The run's first settings.
-        stack: The run's panels.
-        clock: The run's clock.
         contexts_lost: Function that returns the number of GL contexts lost by the panels.
     """
 

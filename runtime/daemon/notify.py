@@ -21,7 +21,6 @@ class Notifier:
         """Connect to systemd if it runs this process.
 
         Args:
-            clock: The run's clock.
             environment: Environment variables, which give the watchdog period (see sd_watchdog_enabled).
         """
         self._clock = clock

@@ -47,7 +47,6 @@ class Reconfiguration:
         Args:
             settings: The new settings.
             old: The current settings.
-            stack: The run's panels.
             reload_content: True to reload the content even if its settings have not changed.
             slots: Memory shared with the presenter's process.
         """
@@ -163,8 +162,6 @@ def ready_predictor(
     """Load the configured model and warm it up.
 
     Args:
-        settings: The run's settings.
-        stack: The run's panels.
         slots: Memory shared with the presenter's process.
         warmed: False to leave out the warming up, so that the first solutions take longer.
 

@@ -52,7 +52,6 @@ class StatusServer:
 
         Args:
             path: Path to the socket.
-            clock: The run's clock.
 
         Raises:
             SocketInUse: Another phasestack process is using the socket.
@@ -257,7 +256,6 @@ def open_status_server(settings: ServiceSettings, *, clock: Clock, supervised: b
 
     Args:
         settings: Settings, which include the path to the socket.
-        clock: The run's clock.
         supervised: True if the run was started by systemd.
 
     Returns:

@@ -71,7 +71,6 @@ class Liveness:
         """Return True if a face is where a picture was found, looks like it and has not moved.
 
         Args:
-            face: The face.
             alike: Smallest correlation between two views of one face.
         """
         return any(face.apart(one) < STILL and face.looks @ one.looks > alike for one in self._pictures)

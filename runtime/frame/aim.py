@@ -92,7 +92,6 @@ class Aim:
             timing: Predicted times for the current refresh.
             eyes: Eyes at the current refresh's display time.
             shown: The latest solution.
-            settings: The run's settings.
             composed_ns: When the current refresh was composed.
             now_ns: When the request is posted.
             flat_wanted: True if the flat picture is shown or will be needed soon.

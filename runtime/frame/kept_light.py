@@ -34,7 +34,6 @@ class Output(Protocol):
         """Write the layers shown by the panels at one refresh.
 
         Args:
-            frame: Refresh number.
             layers: (N, h, w, 4) RGBA layers, rear to front.
         """
 
@@ -42,7 +41,6 @@ class Output(Protocol):
         """Write the target pictures for a refresh whose layers were saved.
 
         Args:
-            frame: Refresh number.
             info: Eye positions, and the pictures' field of view.
             drawn: Pictures for the eye positions used to compute the solution.
             true: Pictures for the true eye positions.

@@ -43,7 +43,6 @@ class SolutionMeter:
         """Measure one solution. Returns None if its pictures exist only as textures.
 
         Args:
-            job: The job that was solved.
             layers: The solution's layers, shape (N, h, w, 4).
             effort: The solution's effort.
             time_ns: Time that the pictures were drawn for.
@@ -98,7 +97,6 @@ def sampled_light(layers: U8, job: Job, places: F64, *, boxes: bool) -> float | 
 
     Args:
         layers: Layers on the job's raster, shape (N, h, w, 4).
-        job: The job that was solved.
         places: Uniform random numbers in [0, 1), shape (2, K, 2). `places[0]` selects the K pixels, as fractions of the
             picture's width and height. The remainders of all numbers modulo 1/64 determine where the two rays lie
             within their pixel.
@@ -170,7 +168,6 @@ def _moved_grid(pictures: Sequence[U8], job: Job, eyes_m: F64) -> list[F32]:
 
     Args:
         pictures: The job's pictures at half size, from `_halved`.
-        job: The job that was solved.
         eyes_m: Eyes after the movement, shape (2, 3).
     """
     stack = job.stack

@@ -38,7 +38,6 @@ class RunObserver:
         """Create an observer for one run.
 
         Args:
-            stack: The display's panels.
             drawer: Draws the target pictures.
             evaluate_every: Measure the quality of every `evaluate_every`-th refresh and of the last one. If 0, measure
                 only the last refresh. If None, measure nothing.

@@ -157,8 +157,6 @@ class Presenter:
 
         Args:
             state: The first settings and calibration.
-            stack: The display's panels.
-            clock: The run's clock.
             pacer: Schedules the refreshes.
             samples: Source of samples.
             viewer: Estimates the viewer's eyes from the samples.

@@ -50,7 +50,6 @@ class SceneCell:
         Args:
             settings: Settings that the content and the model were loaded with.
             content: The scene.
-            predictor: The model.
             version: Version of the first state.
             scene: Number of the scene.
             first_number: Number of the first solution. An earlier solver of the run may have used lower ones.

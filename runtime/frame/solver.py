@@ -41,7 +41,6 @@ class Solver:
 
         Args:
             run: Cell that holds the solver's state.
-            stack: The display's panels.
             timed: True to apply `model.budget_ms`. False on a simulated clock, because results must then not depend on
                 the machine's speed.
         """

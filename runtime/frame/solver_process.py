@@ -66,7 +66,6 @@ class SolverProcess(SolverHost):
 
         Args:
             role: The worker's main function, called with the shared memory's file descriptor and a setup; its limits.
-            stack: The run's panels.
             setup: Function that returns what to start a solver with. Called on another thread.
             clock: The run's clock, which must be the machine's monotonic clock.
             contexts_lost: Function that returns the number of GL contexts lost by the panels. The solver is replaced

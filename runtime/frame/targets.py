@@ -59,7 +59,6 @@ def drawn(order: Draw, content: ContentSource, *, scene: int, stack: PanelStack)
         order: Which pictures to draw.
         content: The current scene.
         scene: The current scene's number. If the order names another one, nothing is drawn.
-        stack: The run's panels.
     """
     if order.scene not in (None, scene):
         return Drawn(order.number, None)

@@ -33,7 +33,6 @@ class Viewer:
         """Create an estimator for a viewer who has not been seen yet.
 
         Args:
-            settings: The run's settings.
             calibration: The sensor's calibration.
             front_m: The front panel's x coordinate in the `stack` frame.
             in_stack_frame: True if the sensor's measurements are already in the `stack` frame.

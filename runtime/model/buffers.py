@@ -51,7 +51,6 @@ class LayerSlots:
 
         Args:
             descriptor: File descriptor of shared memory with `bytes_of(stack)` bytes.
-            stack: The run's panels.
         """
         memory = np.frombuffer(mmap.mmap(descriptor, self.bytes_of(stack)), np.uint8)
         self._states, self._memory = memory[: mmap.PAGESIZE], memory[mmap.PAGESIZE :].reshape(SLOTS, -1)

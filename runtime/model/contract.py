@@ -93,9 +93,6 @@ class Contract(Section):
 def parse_contract(metadata: dict[str, str], *, source: str | Path) -> Contract:
     """Return the contract in an ONNX file's metadata.
 
-    Args:
-        source: File to name in error messages.
-
     Raises:
         InputError: The contract is missing, malformed, invalid or from another version.
     """

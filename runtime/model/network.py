@@ -33,9 +33,6 @@ class PictureProposal:
     def __init__(self, session: ModelSession, stack: PanelStack, *, source: Path) -> None:
         """Create the proposal.
 
-        Args:
-            source: Model file to name in error messages.
-
         Raises:
             InputError: The contract requires another panel size or layout, or the graph's ports have unexpected shapes.
         """

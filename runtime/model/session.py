@@ -157,7 +157,6 @@ class ModelSession:
         If the graph does not specify every size, the model is run once to find out.
 
         Args:
-            source: Model file to name in error messages.
             feeds: Expected input shapes, keyed by name.
             answers: Expected output shapes, keyed by name.
 

@@ -197,9 +197,6 @@ def output_state(display: int, output: int) -> OutputState | None:
     """Return an output's state, or None if the output is off or disconnected.
 
     This takes four round trips to the X server.
-
-    Args:
-        display: Pointer to an Xlib `Display`.
     """
     x11, randr = _libraries()
     resources = randr.XRRGetScreenResourcesCurrent(display, x11.XDefaultRootWindow(display))

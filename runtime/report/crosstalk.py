@@ -189,7 +189,6 @@ def freedom_with_tracking(
     """Measure light where the layers are solved for each place of the head.
 
     Args:
-        stack: Panels.
         scene: Built-in scene.
         solve: Function that returns a pair's light in dB.
 

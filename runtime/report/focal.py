@@ -98,7 +98,6 @@ def focal_stack(
 
     Args:
         painter: Painter that draws the cards (`cards_painter`).
-        stack: Panel geometry.
         model: Model name, or path of an ONNX file.
         focus: Solve with separate pictures for points of the pupils, rather than for pinhole eyes.
         progress: Function called after each plane with the number of planes finished and the total number.

@@ -177,8 +177,6 @@ class PairPainter:
         Args:
             eye_m: The eye's position, shape (3,), in the `stack` frame.
             pixels_from_stack: 3x4 projection from points in the `stack` frame to the picture's pixels.
-            width_px: Picture width.
-            height_px: Picture height.
         """
         from runtime.content.base import View
 

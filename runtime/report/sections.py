@@ -20,7 +20,6 @@ def frontier_section(results: Sequence[MethodResult], *, title: str, name: str) 
     """Return a section with a plot and a table of the methods measured so far at one resolution.
 
     Args:
-        results: Each method's result.
         title: Section heading.
         name: Suffix for the plot's file name.
     """

@@ -290,7 +290,6 @@ def _mcap_records(file: IO[bytes], *, source: Path, max_bytes: int) -> Iterator[
     If a chunk is cut off by the end of the file, its complete records are yielded before the exception is raised.
 
     Args:
-        source: File to name in messages.
         max_bytes: Maximum size of a record, and of a chunk after decompression.
 
     Raises:
@@ -369,7 +368,6 @@ def _unpacked(chunk: Any, *, source: Path, max_bytes: int) -> bytes:
     """Return a chunk's decompressed records as bytes.
 
     Args:
-        source: File to name in messages.
         max_bytes: Maximum size after decompression.
 
     Raises:

@@ -85,7 +85,6 @@ class SensorWorker(Samples):
         Args:
             make_driver: Function that creates a driver without opening it.
             settings: Sensor settings, including the timeout for a read.
-            clock: The run's clock.
             make_find: Function that creates the eye finder, for drivers that do not find eyes themselves.
             keep_images: Keep the pictures in samples after the eyes have been found.
         """

@@ -50,7 +50,6 @@ def in_child(
     Args:
         work: Function at the top level of a module.
         args: Arguments for `work`. They must be picklable.
-        source: File to name in messages.
         seconds: Time limit.
         memory_bytes: Memory limit, by default `MEMORY_MAX`.
 

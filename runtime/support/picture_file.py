@@ -110,7 +110,6 @@ def rgb_of(image: Any, source: object, *, background: Colour = WHITE) -> U8:
 
     Args:
         image: Decoded Pillow image.
-        source: File to name in messages.
         background: Colour behind transparent parts.
 
     Raises:
@@ -174,7 +173,6 @@ def _to_srgb(profile: bytes, colours: str, source: object) -> Any:
     Args:
         profile: ICC profile.
         colours: Mode of the Pillow images to be converted: `L`, `RGB` or `CMYK`.
-        source: File to name in messages.
     """
     try:
         transform = ImageCms.buildTransform(

@@ -362,9 +362,6 @@ def check_size(
     The pixel limit for a PNG with 16 bits per channel is half that for other pictures.
 
     Args:
-        width_px: Picture width.
-        height_px: Picture height.
-        source: File to name in messages.
         field: Field in the file to name in messages.
         name: Name of the picture within the file.
         head: First bytes of the encoded picture, used to detect 16 bits per channel.
@@ -384,7 +381,6 @@ def decoded_picture(coded: bytes, *, source: str | Path, field: str, name: str) 
 
     Args:
         coded: Encoded picture.
-        source: File to name in messages.
         field: Field in the file to name in messages.
         name: Name of the picture within the file.
 

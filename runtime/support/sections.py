@@ -94,7 +94,6 @@ def validated(model: type[M], table: dict[str, Any], *, source: str | Path, fold
     Args:
         model: Record class.
         table: Table to validate.
-        source: File to name in messages.
         folder: Folder that relative paths are resolved against (`runtime.config.paths`). None: leave paths unchanged.
 
     Raises:

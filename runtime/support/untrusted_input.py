@@ -48,7 +48,6 @@ def checked_path(path: str | Path, *, source: str | Path = "", field: str = "") 
     """Check that a path is valid on this system, and return it. The path need not exist.
 
     Args:
-        path: Path to check.
         source: File to name in messages, by default the path itself.
         field: Setting or field to name in messages.
 
@@ -72,7 +71,6 @@ def path_within_folder(path: str, *, source: str | Path, field: str) -> Path:
 
     Args:
         path: Path in an untrusted file, relative to the folder of that file.
-        source: File to name in messages.
         field: Field to name in messages.
 
     Raises:
@@ -112,7 +110,6 @@ def is_there(path: str | Path, *, folder: bool = False) -> bool:
     """Return True if a path exists.
 
     Args:
-        path: Path to check.
         folder: Also require that the path is a folder.
 
     Raises:
@@ -134,7 +131,6 @@ def open_regular(
     exchanged in the meantime.
 
     Args:
-        path: File to open.
         most_bytes: Maximum file size. None: any size.
         source: File to name in messages, by default the path.
         field: Setting or field to name in messages.
@@ -208,7 +204,6 @@ def parsed_json(text: str | bytes, *, source: str | Path, most_depth: int = JSON
 
     Args:
         text: JSON text, as a string or as UTF-8 bytes.
-        source: File to name in messages.
         most_depth: Maximum depth of nested lists and objects.
 
     Raises:
@@ -272,7 +267,6 @@ def within(count: int | float, most: int | float, *, source: str | Path, field: 
     Args:
         count: Count to check.
         most: Limit.
-        source: File to name in messages.
         field: What is counted, for messages, such as `JSON values`.
 
     Raises:

@@ -63,7 +63,6 @@ def real_light(layers: U8, stack: PanelStack, real: RealPanels, sight: Sight, sa
 
     Args:
         layers: (N, H, W, 3 or 4) code values, rear to front.
-        stack: Geometry that the solver assumes.
         real: Imperfections.
         sight: Eyes and targets.
         sampling: Rays to trace.

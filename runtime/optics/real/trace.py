@@ -42,7 +42,6 @@ def crossings(
     Args:
         start_m: (P, 3) points of the pupil, frame `stack`.
         through_m: (P, 3) points on the assumed middle panel.
-        stack: Geometry that the solver assumes.
         real: Imperfections.
         random: Generator for scattering. Unused if no panel scatters.
     """

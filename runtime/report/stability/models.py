@@ -224,7 +224,6 @@ def stressed(
         model: Model name.
         images: Target pictures for the left and right eyes, shape (h, w, 3).
         eyes_m: Left and right eyes, shape (2, 3), in the `stack` frame.
-        stack: Panel geometry.
         light: Measure light (docs/contracts.md, Error) rather than one ray per pixel.
     """
     layers = layers_of(model, images, eyes_m, stack)
