@@ -10,7 +10,7 @@ import numpy as np
 from model_export.scene import Random, draw, random_scene
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack, stack_from_eye
-from runtime.records import F64, U8
+from runtime.records import F64, U8, Eyes
 
 PITCH_WIDTH_M = 0.5184  # the prototype panels' width
 CENTRE = 1  # index of the middle panel of three
@@ -23,7 +23,7 @@ class TrainingPair:
     """A pair of pictures, with the panels and the eye positions that they were rendered for."""
 
     stack: PanelStack
-    eyes_m: F64  # (2, 3) left and right eye, frame `stack`
+    eyes_m: Eyes  # (2, 3) left and right eye, frame `stack`
     images: tuple[U8, U8]  # (h, w, 3) pictures for the left and the right eye
     fov_deg: float  # horizontal field of view of both pictures
 
@@ -60,7 +60,7 @@ def random_eyes(random: Random, stack: PanelStack) -> F64:
     return eyes
 
 
-def is_served(eyes_m: F64, stack: PanelStack) -> bool:
+def is_served(eyes_m: Eyes, stack: PanelStack) -> bool:
     """Return True if each eye sees at least `LEAST_COMMON` of the middle panel through all panels.
 
     Args:

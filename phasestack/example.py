@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from phasestack.stack import Stack
-from runtime.records import F64, U8
+from runtime.records import U8, Eyes
 from runtime.support.artifacts import write_json, write_png
 from runtime.support.picture_file import read_image
 
@@ -22,7 +22,7 @@ class ExamplePair:
 
     left: U8  # (360, 640, 3)
     right: U8  # (360, 640, 3)
-    eyes_m: F64  # left and right eye, (2, 3) metres, frame `stack`
+    eyes_m: Eyes  # left and right eye, (2, 3) metres, frame `stack`
     stack: Stack
     fov_deg: float  # horizontal
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from phasestack.drawing import EyeRequest
-from runtime.records import F64
+from runtime.records import F64, Eyes
 
 IPD_M = 0.063  # distance between the eyes, if only one is known
 NEAREST = 0.9  # nothing is in view that is nearer to the camera than this share of the way from the focal point
@@ -46,7 +46,7 @@ def axes_of(camera: AppCamera) -> F64:
     return np.array([backwards, right, np.cross(backwards, right)])
 
 
-def comfortable_m(eyes_m: F64, comfort_deg: float) -> tuple[float, float]:
+def comfortable_m(eyes_m: Eyes, comfort_deg: float) -> tuple[float, float]:
     """Return how far content may stand in front of the display and behind it, in metres.
 
     A point that is nearer or farther than the display differs from it by the vergence angle ipd · (1/distance -
@@ -65,7 +65,7 @@ def comfortable_m(eyes_m: F64, comfort_deg: float) -> tuple[float, float]:
 
 
 def stack_from_scene(
-    camera: AppCamera, bounds: F64 | None, eyes_m: F64, display_m: tuple[float, float], comfort_deg: float
+    camera: AppCamera, bounds: F64 | None, eyes_m: Eyes, display_m: tuple[float, float], comfort_deg: float
 ) -> F64:
     """Return the affine map (4, 4) from the scene to frame `stack`.
 

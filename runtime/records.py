@@ -19,6 +19,9 @@ F32 = NDArray[np.float32]
 I16 = NDArray[np.int16]
 U8 = NDArray[np.uint8]
 U16 = NDArray[np.uint16]
+# (V, 3) eye positions in metres, frame `stack`: the left and the right eye of a viewer, then those of the next. V is 2
+# unless several viewers are served.
+Eyes = F64
 
 EyesLabel = Literal["exact", "interpolated", "predicted", "held", "rested", "none"]
 Inference = Literal["ran", "reused", "skipped"]

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from runtime.optics.stack import PanelStack
-from runtime.records import F64, EyePoints, PanelFrame, SensorFrame
+from runtime.records import EyePoints, Eyes, PanelFrame, SensorFrame
 
 SAMPLES_MAX = 256  # maximum number of samples waiting for the sensor
 CAPTURES_MAX = 512  # for how many captures the time on the page's clock is stored
@@ -24,7 +24,7 @@ OVERLAY_PX = 320  # width of the camera pictures sent to pages
 class SeenEyes:
     """A sample of eye positions sent by a page."""
 
-    eyes_m: F64 | None  # (2, 3) eyes in the `stack` frame; None if there is no viewer
+    eyes_m: Eyes | None  # (2, 3) eyes in the `stack` frame; None if there is no viewer
     page_ms: float  # the sample's time on the page's clock
 
 

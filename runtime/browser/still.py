@@ -18,7 +18,7 @@ from PIL import Image
 
 from runtime.optics.malus import rest_code
 from runtime.optics.stack import PanelStack
-from runtime.records import F32, F64, U8
+from runtime.records import F32, U8, Eyes
 from runtime.support.artifacts import png_bytes, to_json
 from runtime.support.threads import parallel_map
 
@@ -45,7 +45,7 @@ def viewer_html(
     wanted: Sequence[U8],
     stack: PanelStack,
     *,
-    eyes_m: F64,
+    eyes_m: Eyes,
     fov_deg: float,
     text: Sequence[str],
     relief: F32 | None = None,

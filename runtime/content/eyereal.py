@@ -16,7 +16,7 @@ from runtime.content.placing import SceneFile
 from runtime.content.presets import drawn_scene_from_stack, preset_names
 from runtime.errors import ContentFailure, InputError
 from runtime.optics.views import image_from_stack
-from runtime.records import F64, U8
+from runtime.records import F64, U8, Eyes
 from runtime.support.picture_file import read_image
 
 NUMBER = r"(-?(?:\d+\.?\d*|\.\d+))"
@@ -30,7 +30,7 @@ class Pair:
 
     number: int
     paths: tuple[Path, Path]  # left, right
-    eyes_m: F64  # (2, 3) left and right eye positions, frame `stack`
+    eyes_m: Eyes  # (2, 3) left and right eye positions, frame `stack`
     looks_at_m: F64  # (3,) scene's origin in frame `stack`, where both eyes look; not always on the display
 
     def image_from_stack(self, side: int, *, width_px: int, height_px: int, fov_deg: float) -> F64:

@@ -14,7 +14,7 @@ from runtime.clock import NS_PER_S
 from runtime.config import PoseSettings
 from runtime.errors import InputError
 from runtime.frame.presenter import Refresh
-from runtime.records import F64, SensorFrame
+from runtime.records import F64, Eyes, SensorFrame
 
 log = logging.getLogger("phasestack.pose")
 
@@ -22,14 +22,13 @@ DATAGRAM = struct.Struct("<6d")  # x, y, z in centimetres; yaw, pitch, roll in d
 CM_PER_M = 100.0
 
 
-def pose_of(eyes_m: F64, origin_m: tuple[float, float, float]) -> F64:
+def pose_of(eyes_m: Eyes, origin_m: tuple[float, float, float]) -> F64:
     """Return the head's pose (6,): x, y and z in centimetres, and yaw, pitch and roll in degrees.
 
     Seen by the viewer, x is to the right, y up and z towards the display. Yaw is positive to the right, and roll is
     positive if the head leans to its right shoulder. Pitch is 0, because two eyes do not show it.
 
     Args:
-        eyes_m: (2, 3) left and right eye in frame `stack`.
         origin_m: Position of the midpoint between the eyes at which x, y and z are 0.
     """
     out, right, up = eyes_m.mean(0) - origin_m

@@ -14,7 +14,7 @@ from runtime.evaluation.displayed import EyeViews, eye_names
 from runtime.optics.carried import intensities
 from runtime.optics.pupil import PUPIL_MM, TRACKING_SIGMA_MM
 from runtime.optics.retina import as_codes
-from runtime.records import F32, F64, U8, RefreshAccount
+from runtime.records import F32, U8, Eyes, RefreshAccount
 
 TILE_WIDTH = 640  # pixels
 MARGIN = 12  # pixels
@@ -37,7 +37,7 @@ class Moment:
     light_db: float  # light PSNR for a tracking error of 1 mm
     lines: tuple[str, ...]  # text that states the refresh number and how far the eyes had moved
     solution: U8  # (N, h, w, 3 or 4) layers before alignment
-    solved_for_m: F64  # (2, 3) eyes the solution was computed for, frame `stack`
+    solved_for_m: Eyes  # (2, 3) eyes the solution was computed for, frame `stack`
     asked_for: tuple[U8, ...]  # (h, w, 3) the solution's targets
     relief: F32 | None = None  # (h, w) relief of the solution's content (`optics.relief`)
     account: RefreshAccount | None = None  # the refresh

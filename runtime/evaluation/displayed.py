@@ -17,7 +17,7 @@ from runtime.optics.light import Sampling
 from runtime.optics.quality import Quality, psnr_db, quality
 from runtime.optics.retina import Retina, as_codes, seen_by
 from runtime.optics.stack import PanelStack
-from runtime.records import F32, F64, U8
+from runtime.records import F32, U8, Eyes
 from runtime.support.artifacts import write_png
 from runtime.support.threads import parallel_map
 
@@ -33,7 +33,7 @@ class EyeViews:
     wanted: tuple[Picture, ...]  # the target for each eye
     quality: Quality  # measured exactly at the eyes the layers were solved for or aligned to
     stack: PanelStack
-    eyes_m: F64  # (V, 3) eye positions, frame `stack`
+    eyes_m: Eyes  # (V, 3) eye positions, frame `stack`
     fov_deg: float  # horizontal field of view of the images and targets
 
     def viewer(self, layers: U8, text: Sequence[str], *, relief: F32 | None = None) -> str:
@@ -65,7 +65,7 @@ def eye_names(count: int) -> tuple[str, ...]:
 
 
 def displayed(
-    layers: U8, wanted: Sequence[Picture], stack: PanelStack, *, eyes_m: F64, fov_deg: float, similarity: bool = True
+    layers: U8, wanted: Sequence[Picture], stack: PanelStack, *, eyes_m: Eyes, fov_deg: float, similarity: bool = True
 ) -> EyeViews:
     """Compute the images that eyes see through layers, and compare them with targets.
 

@@ -15,7 +15,7 @@ from runtime.optics.light import Sampling, squared_errors
 from runtime.optics.pupil import TRACKING_SIGMA_MM
 from runtime.optics.quality import Quality
 from runtime.optics.stack import PanelStack
-from runtime.records import F64, U8, RefreshAccount
+from runtime.records import F64, U8, Eyes, RefreshAccount
 
 log = logging.getLogger("phasestack.quality")
 
@@ -47,12 +47,12 @@ class RefreshQuality:
     moment: Moment | None = None  # pictures for the contact sheet and the viewer page
 
 
-def view_error_mm(eyes_m: F64, solved_for_m: F64) -> float:
+def view_error_mm(eyes_m: Eyes, solved_for_m: Eyes) -> float:
     """Return the distance, in millimetres, between the midpoints of two pairs of eyes, each (2, 3)."""
     return 1000 * float(np.linalg.norm((eyes_m - solved_for_m).mean(axis=0)))
 
 
-def live_error(layers: U8, targets: Pictures, stack: PanelStack, *, eyes_m: F64, fov_deg: float) -> float:
+def live_error(layers: U8, targets: Pictures, stack: PanelStack, *, eyes_m: Eyes, fov_deg: float) -> float:
     """Return the mean squared error of the light at two eyes.
 
     Raises:

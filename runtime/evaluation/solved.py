@@ -13,7 +13,7 @@ from runtime.evaluation.contact_sheet import contact_sheet, headline
 from runtime.evaluation.displayed import SIGMAS_MM, EyeViews, Picture, displayed, expected_quality
 from runtime.optics.light import LIGHT, ONE_RAY
 from runtime.optics.stack import PanelStack
-from runtime.records import F64, U8
+from runtime.records import U8, Eyes
 from runtime.support.artifacts import write_png, write_text
 
 BySigma = Mapping[str, float]
@@ -57,7 +57,7 @@ class SolvedPair:
     layers: U8  # (N, h, w, 3 or 4) layers from rear to front
     pictures: Sequence[Picture]  # the target for each eye
     stack: PanelStack
-    eyes_m: F64  # (V, 3) eye positions, frame `stack`
+    eyes_m: Eyes  # (V, 3) eye positions, frame `stack`
     fov_deg: float  # the targets' horizontal field of view
 
     @cached_property

@@ -15,7 +15,7 @@ import numpy as np
 
 from runtime.eyes.face_flow import RIGID
 from runtime.eyes.pupils import CORNERS, Pupils
-from runtime.records import F64, U16, Intrinsics
+from runtime.records import F64, U16, Eyes, Intrinsics
 
 M_PER_MM = 1e-3
 EYE_DISTANCE_M = (0.063, 0.0036)  # mean and standard deviation of adults' eye separations
@@ -36,7 +36,7 @@ PICTURE_SHARE, TURN_SHARE = 0.0007, 0.3  # relative uncertainty added per pictur
 class EyeDepths:
     """The eyes' distances from the camera along the optical axis, in metres."""
 
-    eyes_m: F64  # (2,) left and right eye
+    eyes_m: Eyes  # (2,) left and right eye
     sigma_m: float  # standard deviation of the two distances' mean
 
 

@@ -10,7 +10,7 @@ import math
 from collections import Counter, deque
 from collections.abc import Mapping
 
-from runtime.records import F64
+from runtime.records import Eyes
 
 NOT_NEWER = "not newer than the previous sample"
 NOT_A_NUMBER = "not a number"
@@ -39,13 +39,12 @@ _HINTS = {
 }
 
 
-def reason_against(eyes_m: F64, *, in_front_m: float = 0.0) -> str:
+def reason_against(eyes_m: Eyes, *, in_front_m: float = 0.0) -> str:
     """Return why two points cannot be a viewer's left and right eye, or an empty string if they can.
 
     The eyes count as swapped if the vector from the left eye to the right eye points to the viewer's left.
 
     Args:
-        eyes_m: (2, 3) left and right eye in frame `stack`.
         in_front_m: Both eyes must have a larger x than this.
     """
     (lx, ly, lz), (rx, ry, rz) = eyes_m.tolist()

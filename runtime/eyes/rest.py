@@ -11,7 +11,7 @@ import numpy as np
 
 from runtime.clock import NS_PER_S
 from runtime.eyes.noise import MAD_TO_SIGMA
-from runtime.records import F64
+from runtime.records import F64, Eyes
 
 REST_NS = NS_PER_S  # a head counts as at rest if it has not moved for this long
 LOST_NS = NS_PER_S  # a longer gap between samples than this resets the detector
@@ -51,12 +51,8 @@ class RestWatch:
         self.noise_m = np.zeros(3)  # standard deviation of one eye's sample, in the terms of `_shifts`
         self.sigma_m = 0.0  # standard deviation of `place` along an axis, including undetected drift
 
-    def update(self, eyes_m: F64, *, capture_ns: int) -> None:
-        """Add a sample and update `place`.
-
-        Args:
-            eyes_m: (2, 3) left and right eye in frame `stack`.
-        """
+    def update(self, eyes_m: Eyes, *, capture_ns: int) -> None:
+        """Add a sample and update `place`."""
         if self._count and not 0 < capture_ns - self._times[self._count - 1] < LOST_NS:
             self.forget()
         self._append(eyes_m, capture_ns)
@@ -82,7 +78,7 @@ class RestWatch:
         """Discard all samples, because the face was lost or the clock jumped."""
         self._count, self.place = 0, None
 
-    def _append(self, eyes_m: F64, capture_ns: int) -> None:
+    def _append(self, eyes_m: Eyes, capture_ns: int) -> None:
         if self._count == len(self._times):
             self._keep_last(KEPT)
         self._times[self._count], self._eyes[self._count] = capture_ns, eyes_m
@@ -167,7 +163,7 @@ def _median(samples: F64) -> F64:
     return median
 
 
-def _shifts(eyes_m: F64, place: F64) -> F64:
+def _shifts(eyes_m: Eyes, place: F64) -> F64:
     """Return the (..., 2, 3) displacements of (..., 2, 3) samples from a (2, 3) place, as seen on the display.
 
     Each eye has three displacements in metres: the effect of a change in the eye's distance on points away from the

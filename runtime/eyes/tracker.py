@@ -16,7 +16,7 @@ from runtime.config import TrackerSettings
 from runtime.eyes import imm
 from runtime.eyes.noise import NoiseWatch
 from runtime.eyes.plausibility import NOT_NEWER, reason_against
-from runtime.records import F64, EyePoints, EyesEstimate, EyesLabel
+from runtime.records import F64, EyePoints, Eyes, EyesEstimate, EyesLabel
 
 HISTORY = 256  # number of filtered samples kept: four seconds at 60 Hz
 CONFIDENCE_MIN = 0.3  # samples with less confidence, such as those taken during a blink, are refused
@@ -70,7 +70,7 @@ class _Head:
 
     def eyes_m(self, ahead_s: float) -> F64:
         """Return the (2, 3) left and right eye `ahead_s` seconds after the newest sample."""
-        eyes_m: F64 = EYES_FROM_HEAD @ imm.ahead(self.moments, ahead_s)
+        eyes_m: Eyes = EYES_FROM_HEAD @ imm.ahead(self.moments, ahead_s)
         return eyes_m
 
 
@@ -341,7 +341,7 @@ class Tracker:
         eyes_m = (1 - weight) * before.eyes_m(0.0, time_ns) + weight * eyes_m
         return self._estimate(time_ns, after.head, eyes_m, "interpolated")
 
-    def _estimate(self, time_ns: int, head: _Head, eyes_m: F64, label: EyesLabel) -> EyesEstimate:
+    def _estimate(self, time_ns: int, head: _Head, eyes_m: Eyes, label: EyesLabel) -> EyesEstimate:
         """Return the estimate for `eyes_m`, with a standard deviation that has grown since the sample."""
         age_s = min(max(head.age_s(time_ns), 0.0), SIGMA_AHEAD_S)
         is_past = label in ("exact", "interpolated")

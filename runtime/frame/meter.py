@@ -21,7 +21,7 @@ from runtime.optics.presentation import displacement
 from runtime.optics.relief import parallax
 from runtime.optics.retina import through_layers
 from runtime.optics.stack import PanelStack
-from runtime.records import F32, F64, U8, Effort, Measures
+from runtime.records import F32, F64, U8, Effort, Eyes, Measures
 from runtime.support.gl import DrawnPicture
 
 RAYS = 1024  # rays per eye
@@ -163,7 +163,7 @@ def _grid_lines(picture: U8) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     return rows, columns
 
 
-def _moved_grid(pictures: Sequence[U8], job: Job, eyes_m: F64) -> list[F32]:
+def _moved_grid(pictures: Sequence[U8], job: Job, eyes_m: Eyes) -> list[F32]:
     """Sample a job's pictures on the coarse grid, as the panels would show them once the eyes have moved.
 
     Args:

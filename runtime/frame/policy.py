@@ -12,7 +12,7 @@ from typing import Literal
 
 from runtime.clock import NS_PER_S
 from runtime.plan.savings import Plan, selected_eyes
-from runtime.records import F64, Effort, EyesEstimate, SolveRequest
+from runtime.records import F64, Effort, Eyes, EyesEstimate, SolveRequest
 
 BLEND_S = 0.3  # duration of a blend to or from the flat picture
 
@@ -28,7 +28,7 @@ class SolutionKey:
 
     state_version: int
     revision: int  # content revision
-    eyes_m: F64 | None  # (2, 3) eyes that the solution was computed for; None for a flat picture
+    eyes_m: Eyes | None  # (2, 3) eyes that the solution was computed for; None for a flat picture
     effort: Effort | None = None  # effort spent on the solution
     episode: int = 0  # number of the flat episode; during an episode, the flat picture's viewpoint does not change
 
@@ -38,7 +38,7 @@ class Decision:
     """The solver's next action."""
 
     kind: Kind
-    eyes_m: F64 | None = None  # (2, 3) eyes to solve for
+    eyes_m: Eyes | None = None  # (2, 3) eyes to solve for
 
 
 class FramePolicy:

@@ -22,7 +22,7 @@ from runtime.optics.stack import PanelStack
 from runtime.optics.views import raster_from_stack
 from runtime.plan.drawing import drawn_job
 from runtime.plan.savings import Measured, Plan, make_plan, seeing_eyes
-from runtime.records import F64, U8, Effort, Solution, SolveRequest
+from runtime.records import F64, U8, Effort, Eyes, Solution, SolveRequest
 from runtime.support.gl import DrawnPicture
 
 log = logging.getLogger("phasestack.solver")
@@ -99,11 +99,10 @@ class Solver:
             self._missing = {}  # the latest solution already fulfils the request
         return SolverUpdate(missing=dict(self._missing))
 
-    def trial_ms(self, eyes_m: F64, reduction: int, *, time_ns: int) -> dict[str, float]:
+    def trial_ms(self, eyes_m: Eyes, reduction: int, *, time_ns: int) -> dict[str, float]:
         """Draw and solve once in one step, discard the result, and return the stage times in milliseconds.
 
         Args:
-            eyes_m: (2, 3) left and right eye in frame `stack`.
             reduction: Number to divide the panels' rows and columns by.
             time_ns: Instant to draw the content at.
 
@@ -123,7 +122,7 @@ class Solver:
         return watch.stage_ms
 
     def _solve(
-        self, state: SceneState, request: SolveRequest, eyes_m: F64, effort: Effort, *, revision: int
+        self, state: SceneState, request: SolveRequest, eyes_m: Eyes, effort: Effort, *, revision: int
     ) -> SolverUpdate:
         settings, watch = state.settings.model, Stopwatch()
         sigma_m = request.sigma_m if settings.eye_sigma_mm == "auto" else settings.eye_sigma_mm / 1e3
@@ -169,7 +168,7 @@ class Solver:
         )
         return SolverUpdate(solution=solution)
 
-    def _drawn(self, state: SceneState, request: SolveRequest, eyes_m: F64, reduction: int) -> Job:
+    def _drawn(self, state: SceneState, request: SolveRequest, eyes_m: Eyes, reduction: int) -> Job:
         """Draw a solution's target pictures.
 
         If the head is at rest, the pictures are also copied, because the solution may be refined later.
@@ -216,7 +215,7 @@ class Solver:
         """For the left and the right eye, True if the eye can see the display."""
         return self._seeing
 
-    def _replan(self, state: SceneState, eyes_m: F64 | None) -> None:
+    def _replan(self, state: SceneState, eyes_m: Eyes | None) -> None:
         """Update the plan if the run's state or the set of eyes that can see the display has changed."""
         seeing = self._seeing if eyes_m is None else seeing_eyes(eyes_m, self._seeing)
         self._seeing = seeing

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 
 from runtime.clock import NS_PER_S
-from runtime.records import F64
+from runtime.records import F64, Eyes
 
 GAP_NS = NS_PER_S // 5  # maximum gap between samples to interpolate across
 KEPT = 512  # maximum number of samples kept, eight seconds at 60 Hz
@@ -23,7 +23,7 @@ class TrueEyes:
         """True once a sample has contained true eyes, which are found only in recordings."""
         return bool(self._known)
 
-    def add(self, capture_ns: int, eyes_m: F64) -> None:
+    def add(self, capture_ns: int, eyes_m: Eyes) -> None:
         """Add a sample's true eyes (2, 3), in the `stack` frame."""
         if not self._known or capture_ns > self._known[-1][0]:
             self._known.append((capture_ns, eyes_m))

@@ -13,7 +13,7 @@ import numpy as np
 from runtime.clock import Stopwatch
 from runtime.model.job import Job, Savings, grey_job
 from runtime.optics.stack import PanelStack
-from runtime.records import F64, U8
+from runtime.records import F64, U8, Eyes
 
 if TYPE_CHECKING:
     from runtime.model.buffers import LayerSlots
@@ -95,13 +95,10 @@ class Predictor(ABC):
             EyesNotServed: The model does not support the job's eye positions.
         """
 
-    def warm_up(self, eyes_m: F64) -> None:
+    def warm_up(self, eyes_m: Eyes) -> None:
         """Solve grey pictures in one step on every raster, to allocate all memory before the first frame.
 
         The stage times are kept in `warmed_ms`.
-
-        Args:
-            eyes_m: (2, 3) left and right eye in frame `stack`.
         """
         measured = {}
         for reduction in self.reductions:

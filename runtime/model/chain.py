@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.optics.stack import PanelStack, Plane
-from runtime.records import F32, F64
+from runtime.records import F32, F64, Eyes
 
 CELLS_STEP = 8  # chain lengths are rounded up to a multiple of this, so that a moving viewer causes few shapes
 ROWS_STEP = 32  # if the eyes are not level, the number of rows is rounded up to a multiple of this
@@ -128,7 +128,7 @@ class ChainFrame:
         return np.array([columns, rows, cell_px * centre / reach], np.float32)
 
 
-def chain_frame(eyes_m: F64, stack: PanelStack, *, most_cell_px: int, reduction: int) -> ChainFrame:
+def chain_frame(eyes_m: Eyes, stack: PanelStack, *, most_cell_px: int, reduction: int) -> ChainFrame:
     """Return the raster for a pair of eyes.
 
     The raster covers the part of the panels that the eyes see through all of them, plus a margin. Its rows are sheared
@@ -136,7 +136,6 @@ def chain_frame(eyes_m: F64, stack: PanelStack, *, most_cell_px: int, reduction:
     at most `WIDEST` wide, but no more than `most_cell_px` columns.
 
     Args:
-        eyes_m: (2, 3) left and right eye in frame `stack`.
         most_cell_px: The outer panels' maximum parallax, in raster columns (K).
         reduction: Row height in panel rows. If the eyes are not level, rows may be taller.
 

@@ -19,7 +19,7 @@ from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, Plane, PlaneRaster
 from runtime.optics.tilt import coarse_layer_from_seen, layer_pixels_from_seen
 from runtime.optics.views import stack_from_eye
-from runtime.records import F32, F64, U8
+from runtime.records import F32, F64, U8, Eyes
 from runtime.support.gl import DrawnPicture
 
 PAD_PX = 2  # margin around the visible pixels
@@ -75,7 +75,7 @@ class Geometry:
     """The pixels that one solution computes, and the rays it considers."""
 
     stack: PanelStack
-    eyes_m: F64  # (V, 3), frame `stack`
+    eyes_m: Eyes  # (V, 3), frame `stack`
     boxes: tuple[PixelRect, ...]  # solved pixels of each panel
     kept: PixelRect  # part of the middle panel's box that rays pass through
     rays: PixelRect  # picture pixels whose rays pass through `kept`
@@ -191,7 +191,7 @@ def inverse(homographies: F64) -> F64:
 
 def geometry_of(
     stack: PanelStack,
-    eyes_m: F64,
+    eyes_m: Eyes,
     views: Sequence[TargetView],
     *,
     boxes: tuple[PixelRect, ...],
@@ -202,7 +202,6 @@ def geometry_of(
     """Return the geometry for those rays of all views that pass through a part of the middle panel.
 
     Args:
-        eyes_m: (V, 3) eye positions in frame `stack`.
         views: What each eye should see.
         boxes: Pixels to solve on each panel.
         kept: Part of the middle panel that the rays pass through. By default, the middle panel's box.
@@ -271,13 +270,10 @@ def panel_from_middle(stack: PanelStack, rasters: Sequence[PlaneRaster], eye_m: 
     return np.asarray(matrix / matrix[2, 2], np.float64)
 
 
-def visible_boxes(eyes_m: F64, stack: PanelStack) -> tuple[PixelRect, ...]:
+def visible_boxes(eyes_m: Eyes, stack: PanelStack) -> tuple[PixelRect, ...]:
     """Return, for each panel, the padded box of pixels that an eye sees through all the other panels.
 
     If the eyes see nothing through all the panels, there is nothing to solve, and the boxes have the minimum size.
-
-    Args:
-        eyes_m: (V, 3) eye positions in frame `stack`.
     """
     planes, half = [Plane(x_m) for x_m in stack.x_m], np.array([stack.width_m, stack.height_m]) / 2
     middle = planes[stack.count // 2]

@@ -15,7 +15,7 @@ from runtime.model.warp import reduced_view
 from runtime.optics.pupil import TRACKING_SIGMA_MM
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
-from runtime.records import F32, F64, U8
+from runtime.records import F32, F64, U8, Eyes
 from runtime.support.gl import DrawnPicture
 from runtime.support.threads import parallel_map
 
@@ -44,7 +44,7 @@ class Targets:
 
     stack: PanelStack  # the panels, with the raster to solve, which may be coarser than the display's
     # (V, 3) eye positions, frame `stack`: the first viewer's left and right eye, then the next viewer's
-    eyes_m: F64
+    eyes_m: Eyes
     views: tuple[TargetView, ...]  # what each of these eyes should see
     # Points of each pupil that have separate views; `eyes_m` and `views` list all eyes for each point in turn
     points: int = 1
@@ -155,21 +155,16 @@ def drawn_views(
     return tuple(TargetView(picture, raster.plane_from_raster()) for picture in pictures)
 
 
-def drawn_job(pictures: Sequence[U8 | DrawnPicture], eyes_m: F64, stack: PanelStack) -> Job:
+def drawn_job(pictures: Sequence[U8 | DrawnPicture], eyes_m: Eyes, stack: PanelStack) -> Job:
     """Return a job, without a window, for pictures drawn on the middle panel's pixels.
 
     Args:
         pictures: Each eye's (h, w, 3 or 4) picture.
-        eyes_m: (V, 3) eye positions in frame `stack`.
     """
     return Job(Targets(stack, eyes_m, drawn_views(pictures, stack)))
 
 
-def grey_job(eyes_m: F64, stack: PanelStack) -> Job:
-    """Return a job with uniform grey pictures, used to warm up a model.
-
-    Args:
-        eyes_m: (2, 3) left and right eye in frame `stack`.
-    """
+def grey_job(eyes_m: Eyes, stack: PanelStack) -> Job:
+    """Return a job with uniform grey pictures, used to warm up a model."""
     grey = np.full((stack.height_px, stack.width_px, 4), 128, np.uint8)
     return drawn_job((grey, grey), eyes_m, stack)

@@ -25,7 +25,7 @@ from runtime.model.targets import phase_codes, rest_of, without_alpha
 from runtime.model.warp import REACH_PX, warp
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.tilt import coarse_layer_from_seen
-from runtime.records import F32, F64, I16
+from runtime.records import F32, F64, I16, Eyes
 from runtime.support.threads import parallel_map
 
 INPUTS = (
@@ -78,7 +78,7 @@ class _Local:
     """A window of the panels as a separate stack, possibly transposed to make the eyes roughly level."""
 
     stack: PanelStack
-    eyes_m: F64  # (2, 3) eyes in the window's frame; the first eye is on the left in this frame
+    eyes_m: Eyes  # (2, 3) eyes in the window's frame; the first eye is on the left in this frame
     order: tuple[int, int]  # indices of these eyes in the job
     plane_from_local: F64  # 3x3 map from (y, z, 1) in the window's frame to (y, z, 1) in frame `stack`
 
@@ -253,7 +253,7 @@ def _transposed(local: _Local) -> _Local:
     return _Local(stack, eyes_m, order, local.plane_from_local @ _SWAPPED)
 
 
-def _left_first(eyes_m: F64) -> tuple[F64, tuple[int, int]]:
+def _left_first(eyes_m: Eyes) -> tuple[F64, tuple[int, int]]:
     """Return the (2, 3) eyes ordered from left to right, and their indices."""
     order = (0, 1) if eyes_m[1, 1] >= eyes_m[0, 1] else (1, 0)
     return eyes_m[list(order)], order

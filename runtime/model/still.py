@@ -16,14 +16,14 @@ from runtime.model.warp import resized_px, source_px
 from runtime.optics.pupil import TRACKING_SIGMA_MM
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_raster, image_from_stack
-from runtime.records import F64, U8
+from runtime.records import U8, Eyes
 
 RAYS_PX = 0.6, 1.6  # pictures with fewer or more pixels per panel pixel are resized to have one
 
 
 def solve_still(
     *pictures: U8,
-    eyes_m: F64,
+    eyes_m: Eyes,
     fov_deg: float,
     predictor: Predictor,
     eye_sigma_mm: float = TRACKING_SIGMA_MM,
@@ -52,14 +52,15 @@ def solve_still(
     return predictor.solve(job, watch)
 
 
-def captured_views(pictures: Sequence[U8], eyes_m: F64, stack: PanelStack, *, fov_deg: float) -> tuple[TargetView, ...]:
+def captured_views(
+    pictures: Sequence[U8], eyes_m: Eyes, stack: PanelStack, *, fov_deg: float
+) -> tuple[TargetView, ...]:
     """Return the views for captured pictures of one size.
 
     Pictures are resized if their resolution differs from the panels'.
 
     Args:
         pictures: Each eye's (h, w, 3) picture, taken from the eye position with the camera aimed at the stack's origin.
-        eyes_m: (V, 3) eye positions in frame `stack`.
         fov_deg: The pictures' horizontal field of view.
     """
     height, width = pictures[0].shape[:2]

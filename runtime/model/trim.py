@@ -18,7 +18,7 @@ from runtime.model.targets import is_grey
 from runtime.model.warp import picture_on
 from runtime.optics.rect import PixelRect, union
 from runtime.optics.stack import PanelStack, Plane
-from runtime.records import F64, U8
+from runtime.records import F64, U8, Eyes
 from runtime.support.gl import DrawnPicture
 from runtime.support.threads import PIECE_ROWS, parallel_map
 
@@ -53,14 +53,13 @@ def trim(job: Job, before: SolveWindow | None = None) -> Job:
 
 
 def extent_window(
-    extent: PixelRect, colour: tuple[int, ...], eyes_m: F64, stack: PanelStack, before: SolveWindow | None = None
+    extent: PixelRect, colour: tuple[int, ...], eyes_m: Eyes, stack: PanelStack, before: SolveWindow | None = None
 ) -> SolveWindow | None:
     """Return the window for content with an extent that is known before the content is drawn.
 
     Args:
         extent: Middle-panel pixels. Outside them, both eyes see only the background.
         colour: The background's 8-bit codes.
-        eyes_m: (V, 3) eye positions in frame `stack`.
         before: The previous solution's window, which is kept if it still fits.
 
     Returns:
@@ -132,7 +131,7 @@ def _compared(job: Job) -> tuple[list[U8], tuple[int, int]]:
 
 
 def _window_around(
-    box: PixelRect, eyes_m: F64, stack: PanelStack, before: SolveWindow | None, *, steep: float
+    box: PixelRect, eyes_m: Eyes, stack: PanelStack, before: SolveWindow | None, *, steep: float
 ) -> SolveWindow | None:
     """Return the window for a box where the eyes' pictures differ.
 
@@ -197,11 +196,8 @@ def _box(left: U8, right: U8, tolerance: int) -> PixelRect:
     return PixelRect(u, v, u + width, v + height)
 
 
-def parallax_margin_px(eyes_m: F64, stack: PanelStack) -> F64:
+def parallax_margin_px(eyes_m: Eyes, stack: PanelStack) -> F64:
     """Return how far rays through the middle panel's centre are shifted on each panel.
-
-    Args:
-        eyes_m: (V, 3) eye positions in frame `stack`.
 
     Returns:
         (V, N, 2) shifts in pixels. The axes are the eye, the panel, and the direction (right, down). For rays through
@@ -235,17 +231,13 @@ def taper_parallaxes(steep: float) -> float:
     return least + (most - least) * steep
 
 
-def taper_px(eyes_m: F64, stack: PanelStack, *, parallaxes: float) -> tuple[float, float]:
-    """Convert a taper's width from parallaxes to pixels (right, down).
-
-    Args:
-        eyes_m: (V, 3) eye positions in frame `stack`.
-    """
+def taper_px(eyes_m: Eyes, stack: PanelStack, *, parallaxes: float) -> tuple[float, float]:
+    """Convert a taper's width from parallaxes to pixels (right, down)."""
     across, down = np.ptp(parallax_margin_px(eyes_m, stack), axis=0).max(axis=0) * parallaxes
     return float(across), float(down)
 
 
-def whole_rays(box: PixelRect, eyes_m: F64, stack: PanelStack) -> PixelRect:
+def whole_rays(box: PixelRect, eyes_m: Eyes, stack: PanelStack) -> PixelRect:
     """Return the part of a window where rays stay inside the window on every panel.
 
     Rays may leave the window at panel edges.
@@ -266,7 +258,7 @@ def whole_rays(box: PixelRect, eyes_m: F64, stack: PanelStack) -> PixelRect:
     return PixelRect(u0, v0, u1, v1)
 
 
-def _scale_shift_px(eyes_m: F64, stack: PanelStack) -> tuple[F64, F64]:
+def _scale_shift_px(eyes_m: Eyes, stack: PanelStack) -> tuple[F64, F64]:
     """Return the maps from the centre panel to each panel along each eye's rays.
 
     Pixels are measured from the panels' centres, right and down.
@@ -280,13 +272,12 @@ def _scale_shift_px(eyes_m: F64, stack: PanelStack) -> tuple[F64, F64]:
     return np.stack(scales, axis=1), np.stack(shifts_m, axis=1) * px_per_m
 
 
-def window_around(box: PixelRect, eyes_m: F64, stack: PanelStack, *, parallaxes: float) -> PixelRect | None:
+def window_around(box: PixelRect, eyes_m: Eyes, stack: PanelStack, *, parallaxes: float) -> PixelRect | None:
     """Return the window needed to solve a box where the eyes' pictures differ.
 
     The window includes margins, and its sides are rounded up to sixteenths of the panel's.
 
     Args:
-        eyes_m: (V, 3) eye positions in frame `stack`.
         parallaxes: Taper width (`taper_parallaxes`).
 
     Returns:

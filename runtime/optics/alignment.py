@@ -25,7 +25,7 @@ import numpy as np
 
 from runtime.optics.relief import parallax
 from runtime.optics.stack import PanelStack, Plane
-from runtime.records import F64, Parallax
+from runtime.records import F64, Eyes, Parallax
 
 FARTHEST_M = 1e6  # larger coordinates are treated as not finite
 NEAREST_M = 0.01  # minimum distance between an eye and the front panel
@@ -53,7 +53,7 @@ def reference_plane(stack: PanelStack) -> Plane:
     return Plane(stack.x_m[half] if stack.count % 2 else (stack.x_m[half - 1] + stack.x_m[half]) / 2)
 
 
-def align(stack: PanelStack, *, solved_for_m: F64, eyes_m: F64) -> Alignment:
+def align(stack: PanelStack, *, solved_for_m: Eyes, eyes_m: Eyes) -> Alignment:
     """Align layers that were solved for other eye positions to the current eyes.
 
     An alignment has three limits: each eye must be at least `NEAREST_M` in front of the front panel, a panel's centre
@@ -83,7 +83,7 @@ def align(stack: PanelStack, *, solved_for_m: F64, eyes_m: F64) -> Alignment:
     return Alignment(maps, limited, parallax(stack, old_m=old_m, new_m=old_m + step_m))
 
 
-def _middle(eyes_m: F64) -> F64:
+def _middle(eyes_m: Eyes) -> F64:
     middle: F64 = (eyes_m[0] + eyes_m[1]) / 2
     return middle
 
@@ -119,7 +119,7 @@ def _limits(
         yield step[0] * (weight + smaller), -smaller * distance_m, str(n)
 
 
-def _reason(limit: str, stack: PanelStack, eyes_m: F64, *, moved_m: float) -> str:
+def _reason(limit: str, stack: PanelStack, eyes_m: Eyes, *, moved_m: float) -> str:
     """Return the message for an exceeded limit, named as by `_limits`."""
     if limit in ("left", "right"):
         distance_m = eyes_m[("left", "right").index(limit), 0] - stack.x_m[-1]

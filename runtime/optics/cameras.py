@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from runtime.optics.retina import Rays
 from runtime.optics.stack import PanelStack, between_pixel_centres
 from runtime.optics.views import stack_from_eye
-from runtime.records import F32, F64, U8
+from runtime.records import F32, F64, U8, Eyes
 
 OUTSIDE_MOST = 1 / 3  # warn if more than this share of a picture is outside the panels
 LEAST_PX = 16  # minimum width and height of a resampled picture
@@ -52,7 +52,7 @@ def as_cameras(matrices: Any, *, count: int = 2) -> tuple[F64, F64]:
 
 
 def looking_at_origin(
-    pictures: Sequence[Picture], cameras: F64, eyes_m: F64, stack: PanelStack
+    pictures: Sequence[Picture], cameras: F64, eyes_m: Eyes, stack: PanelStack
 ) -> tuple[list[Picture], float]:
     """Resample cameras' pictures as if the cameras had been aimed at the stack's origin.
 

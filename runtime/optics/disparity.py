@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from runtime.optics.rpu import panel_from_image
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.views import image_from_stack
-from runtime.records import F32, F64, U8
+from runtime.records import F32, F64, U8, Eyes
 
 WIDTH_PX = 256  # width of the middle-panel raster used to compare the pictures
 REACH_PX = WIDTH_PX // 4  # largest disparity searched, in either direction
@@ -85,7 +85,7 @@ class _Compared:
         return np.asarray(matched[once] * self.panel.pitch_u_m, np.float64)
 
 
-def _compared(pictures: Sequence[U8 | F32], eyes_m: F64, stack: PanelStack, *, fov_deg: float) -> _Compared:
+def _compared(pictures: Sequence[U8 | F32], eyes_m: Eyes, stack: PanelStack, *, fov_deg: float) -> _Compared:
     """Resample two pictures to a coarse middle-panel raster.
 
     Args:
@@ -136,7 +136,7 @@ def _is_ambiguous(left: U8, right: U8, matched: F64) -> NDArray[np.bool_]:
 
 
 def disparity_doubts(
-    pictures: Sequence[U8 | F32], eyes_m: F64, stack: PanelStack, *, fov_deg: float, parallel: bool = True
+    pictures: Sequence[U8 | F32], eyes_m: Eyes, stack: PanelStack, *, fov_deg: float, parallel: bool = True
 ) -> list[str]:
     """Return a one-line warning, in a list, if the pictures will cause ghosts, or an empty list.
 

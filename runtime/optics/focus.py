@@ -18,7 +18,7 @@ from runtime.optics.quality import psnr_db
 from runtime.optics.retina import Rays, average, pupil_points, through_layers
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack, stack_from_eye
-from runtime.records import F32, F64, U8
+from runtime.records import F32, F64, U8, Eyes
 
 # Points of each pupil that get separate pictures when content is solved for focus, as (right, up) in metres
 SOLVED_POINTS_M = ((-0.00085, -0.00085), (0.00085, 0.00085))
@@ -90,11 +90,8 @@ def retina_db(pictures: Iterable[tuple[F32, F32]]) -> float:
     return psnr_db(total / counted)
 
 
-def points_of_pupils(eyes_m: F64) -> F64:
+def points_of_pupils(eyes_m: Eyes) -> F64:
     """Return the points of each pupil that get separate pictures when content is solved for focus.
-
-    Args:
-        eyes_m: (V, 3) eyes in frame `stack`.
 
     Returns:
         (2V, 3) positions, which list all eyes for each point in turn.

@@ -27,7 +27,7 @@ from runtime.optics.rpu import panel_from_image
 from runtime.optics.stack import PanelStack
 from runtime.optics.tilt import layer_from_seen, layer_pixels_from_seen
 from runtime.optics.views import stack_from_eye
-from runtime.records import F32, F64, U8
+from runtime.records import F32, F64, U8, Eyes
 
 RINGS = 9  # rings of points on the pupil; these 271 points are as good as a disc
 
@@ -60,8 +60,8 @@ def squared_errors(
     targets: Sequence[F32],
     stack: PanelStack,
     *,
-    solved_for_m: F64,
-    eyes_m: F64,
+    solved_for_m: Eyes,
+    eyes_m: Eyes,
     fov_deg: float,
     sampling: Sampling,
 ) -> F64:

@@ -15,15 +15,14 @@ from runtime.optics.rect import PixelRect, union
 from runtime.optics.relief import COARSE_RIM_PX, RIM_PX, block_px, relief_of
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.views import image_from_stack, raster_from_stack
-from runtime.records import F32, F64, U8
+from runtime.records import F32, F64, U8, Eyes
 from runtime.support.gl import DrawnPicture
 
 
-def raster_views(eyes_m: F64, raster: PlaneRaster, *, reduction: int = 1) -> tuple[View, View]:
+def raster_views(eyes_m: Eyes, raster: PlaneRaster, *, reduction: int = 1) -> tuple[View, View]:
     """Return the left and the right eye's view, used to draw content on a raster.
 
     Args:
-        eyes_m: (2, 3) left and right eye in frame `stack`.
         raster: Pixels to draw on, usually the middle panel's.
         reduction: The panels' number of rows and columns, divided by the raster's.
     """
@@ -47,7 +46,7 @@ def retina_view(eye_m: F64, side: int, *, width_px: int, height_px: int, fov_deg
 
 
 def retina_pictures(
-    content: ContentSource, eyes_m: F64, stack: PanelStack, *, fov_deg: float, time_ns: int
+    content: ContentSource, eyes_m: Eyes, stack: PanelStack, *, fov_deg: float, time_ns: int
 ) -> tuple[U8, U8]:
     """Draw the (h, w, 3) pictures that the two eyes should see, with as many pixels as a panel.
 
@@ -66,7 +65,7 @@ def retina_pictures(
 def drawn_job(
     predictor: Predictor,
     content: ContentSource,
-    eyes_m: F64,
+    eyes_m: Eyes,
     *,
     time_ns: int,
     reduction: int = 1,
@@ -80,7 +79,6 @@ def drawn_job(
     arrays owned by the content source.
 
     Args:
-        eyes_m: (2, 3) left and right eye in frame `stack`.
         time_ns: Time on the run's clock, for moving content.
         reduction: Number to divide the panels' rows and columns by.
         trimmed: True to skip work that the scene does not need (`trim`). If the content knows its extent, the rest of
@@ -113,7 +111,7 @@ def drawn_job(
     return trim(job, before) if trimmed else job
 
 
-def _extent(content: ContentSource, eyes_m: F64, middle: PlaneRaster, *, time_ns: int) -> PixelRect | None:
+def _extent(content: ContentSource, eyes_m: Eyes, middle: PlaneRaster, *, time_ns: int) -> PixelRect | None:
     """Return the middle-panel box to draw. Outside it, both eyes see only the background.
 
     Returns None if the content does not know its extent.

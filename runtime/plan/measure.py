@@ -25,7 +25,7 @@ from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
 from runtime.plan.drawing import drawn_job, retina_pictures
 from runtime.plan.savings import Measured, Saving, make_plan
-from runtime.records import F64, U8
+from runtime.records import F64, U8, Eyes
 from runtime.support.gl import offscreen_context
 from runtime.support.progress import tell
 
@@ -54,11 +54,10 @@ class Measurement(NamedTuple):
     without: TrialResult
 
 
-def measure(predictor: Predictor, content: ContentSource, eyes_m: F64, *, fov_deg: float) -> Measurement:
+def measure(predictor: Predictor, content: ContentSource, eyes_m: Eyes, *, fov_deg: float) -> Measurement:
     """Measure a scene with and without each saving.
 
     Args:
-        eyes_m: (2, 3) left and right eye in frame `stack`.
         fov_deg: Horizontal field of view of the pictures used to measure quality.
     """
     stack = predictor.stack
@@ -154,7 +153,7 @@ def plan_for(config: Path | None, *, scene: str | None, model: str | None, scale
         }
 
 
-def _check_viewer(eyes_m: F64, stack: PanelStack, *, fov_deg: float) -> None:
+def _check_viewer(eyes_m: Eyes, stack: PanelStack, *, fov_deg: float) -> None:
     """Raise InputError if an eye is not in front of the panels or neither eye sees any of the display."""
     nearest_m = float(eyes_m[:, 0].min())
     if nearest_m <= max(stack.x_m):

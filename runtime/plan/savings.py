@@ -9,7 +9,7 @@ import numpy as np
 from runtime.config import Settings
 from runtime.content.base import ContentInfo
 from runtime.model.job import Savings
-from runtime.records import F64, PlanItem
+from runtime.records import F64, Eyes, PlanItem
 
 VISIBLE_DEG = 80.0  # an eye farther than this from the display's axis cannot see the display
 RETURN_MARGIN_DEG = 3.0  # three standard deviations of an eye's direction at 0.2 m with 3 mm of noise
@@ -42,27 +42,23 @@ class Plan:
     items: tuple[PlanItem, ...] = field(default=())  # one item for each kind of skipped work
 
 
-def eyes_in_range(eyes_m: F64, *, range_deg: float = VISIBLE_DEG) -> tuple[bool, bool]:
+def eyes_in_range(eyes_m: Eyes, *, range_deg: float = VISIBLE_DEG) -> tuple[bool, bool]:
     """Return, for each of the left and the right eye, True if it can see the display.
 
     An eye can see the display if, viewed from the display's centre, it is within `range_deg` of the display's axis.
-
-    Args:
-        eyes_m: (2, 3) left and right eye in frame `stack`.
     """
     off_axis = np.degrees(np.arctan2(np.linalg.norm(eyes_m[:, 1:], axis=1), eyes_m[:, 0]))
     left, right = (off_axis <= range_deg).tolist()
     return left, right
 
 
-def seeing_eyes(eyes_m: F64, before: tuple[bool, bool]) -> tuple[bool, bool]:
+def seeing_eyes(eyes_m: Eyes, before: tuple[bool, bool]) -> tuple[bool, bool]:
     """Return, for each of the left and the right eye, True if it can see the display, with hysteresis.
 
     An eye that was excluded is included again only once it is at least `RETURN_MARGIN_DEG` inside the range. Without
     hysteresis, noise would switch an eye on and off at the limit of the range.
 
     Args:
-        eyes_m: (2, 3) left and right eye in frame `stack`.
         before: Previous result.
     """
     outer = eyes_in_range(eyes_m)
@@ -71,13 +67,12 @@ def seeing_eyes(eyes_m: F64, before: tuple[bool, bool]) -> tuple[bool, bool]:
     return left, right
 
 
-def selected_eyes(eyes_m: F64, seeing: tuple[bool, bool]) -> F64:
+def selected_eyes(eyes_m: Eyes, seeing: tuple[bool, bool]) -> F64:
     """Return the (2, 3) eyes to draw and to solve for.
 
     An eye that cannot see the display is replaced by the eye that can. If neither can, both eyes are returned.
 
     Args:
-        eyes_m: (2, 3) left and right eye in frame `stack`.
         seeing: For the left and the right eye, True if the eye can see the display (`seeing_eyes`).
     """
     if seeing == (True, False):
@@ -91,7 +86,7 @@ def make_plan(
     info: ContentInfo,
     settings: Settings,
     *,
-    eyes_m: F64 | None = None,
+    eyes_m: Eyes | None = None,
     seeing: tuple[bool, bool] | None = None,
     measured: Measured | None = None,
 ) -> Plan:

@@ -23,7 +23,7 @@ from runtime.optics.quality import psnr_db
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack
-from runtime.records import F64, U8
+from runtime.records import F64, U8, Eyes
 from runtime.report.pairs import PairPainter, StillPair, eyes_at
 
 WIDTH_PX = 960  # crosstalk is measured on panels with at most this many columns
@@ -52,7 +52,7 @@ def reduced(stack: PanelStack) -> PanelStack:
     return stack.reduced(max(1, math.ceil(stack.width_px / WIDTH_PX)))
 
 
-def parallax_m(stack: PanelStack, eyes_m: F64) -> float:
+def parallax_m(stack: PanelStack, eyes_m: Eyes) -> float:
     """Return an outer panel's parallax for each eye on the middle plane (docs/mathematics.md)."""
     middle = eyes_m.mean(axis=0)
     gap_m = (stack.x_m[-1] - stack.x_m[0]) / 2
@@ -68,7 +68,7 @@ def theory_percent(width_m: float, parallax: float) -> float:
 class Patches:
     """Solves for patches that the two eyes see differently."""
 
-    def __init__(self, stack: PanelStack, eyes_m: F64, predictor: Predictor) -> None:
+    def __init__(self, stack: PanelStack, eyes_m: Eyes, predictor: Predictor) -> None:
         """Prepare to measure with `predictor`, which must have been loaded for the same stack."""
         self.stack, self.eyes_m, self._predictor = stack, eyes_m, predictor
         self._is_regular = stack.count == 3 and stack.is_evenly_spaced

@@ -18,7 +18,7 @@ from runtime.optics.focus import FocusCamera, points_of_pupils, retina_db
 from runtime.optics.pupil import PUPIL_MM
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import raster_from_stack
-from runtime.records import F32, F64, U8
+from runtime.records import F32, F64, U8, Eyes
 from runtime.report.pairs import PairPainter, eyes_at
 
 CAMERA = FocusCamera(720, 300, 18.0)
@@ -134,7 +134,7 @@ def focal_stack(
     return FocalStack(model, tuple(slices), cards, retina, focus)
 
 
-def cards_layers(painter: PairPainter, stack: PanelStack, eyes_m: F64, *, model: str, focus: bool) -> U8:
+def cards_layers(painter: PairPainter, stack: PanelStack, eyes_m: Eyes, *, model: str, focus: bool) -> U8:
     """Solve the painter's scene for two eyes, and return the layers (N, h, w, 4)."""
     raster = stack.panel(stack.count // 2)
     size = {"width_px": stack.width_px, "height_px": stack.height_px}

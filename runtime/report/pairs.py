@@ -17,7 +17,7 @@ from runtime.errors import InputError
 from runtime.model.job import VIEWS_MOST
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack, stack_from_eye
-from runtime.records import F64, U8
+from runtime.records import F64, U8, Eyes
 from runtime.support.picture_file import read_image
 from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG
 
@@ -45,7 +45,7 @@ class StillPair:
 
     name: str
     stack: PanelStack
-    eyes_m: F64  # (V, 3) frame `stack`: the first viewer's left and right eye, then the next viewer's
+    eyes_m: Eyes  # (V, 3) frame `stack`: the first viewer's left and right eye, then the next viewer's
     images: tuple[U8, ...]  # each eye's picture, (h, w, 3)
     fov_deg: float  # horizontal field of view
     off: tuple[OffView, ...] = ()  # further targets, for displaced eyes
@@ -188,12 +188,11 @@ class PairPainter:
         projection = image_from_stack(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
         return np.ascontiguousarray(self.draw(eye_m, projection, width_px=width_px, height_px=height_px)[..., :3])
 
-    def pair(self, name: str, eyes_m: F64, *, fov_deg: float = FOV_DEG, off_mm: Sequence[float] = OFF_MM) -> StillPair:
+    def pair(self, name: str, eyes_m: Eyes, *, fov_deg: float = FOV_DEG, off_mm: Sequence[float] = OFF_MM) -> StillPair:
         """Draw a pair at the panels' resolution, with targets for displaced eyes.
 
         Args:
             name: Pair name.
-            eyes_m: Left and right eyes, shape (2, 3), in the `stack` frame.
             fov_deg: The pictures' horizontal field of view.
             off_mm: Displacements. For each displacement, both eyes are moved right, up, left and down.
         """

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, WithJsonSchema
 
 from runtime.clock import NS_PER_S
-from runtime.records import F64, U8, U16, EyePoints, Intrinsics, SensorFrame
+from runtime.records import F64, U8, U16, EyePoints, Eyes, Intrinsics, SensorFrame
 from runtime.support.picture_header import is_cut_off, picture_size
 
 SCHEMA_VERSION = 1
@@ -164,7 +164,7 @@ def _read(kind: type[M], data: bytes) -> M:
         raise ValueError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
 
 
-def _points(eyes_m: F64 | None) -> list[list[float | None]] | None:
+def _points(eyes_m: Eyes | None) -> list[list[float | None]] | None:
     if eyes_m is None:
         return None
     return [[round(float(x), POSITION_DIGITS) if np.isfinite(x) else None for x in eye] for eye in eyes_m]

@@ -17,7 +17,7 @@ from runtime.optics.real.trace import Tables, crossings, moments
 from runtime.optics.retina import checked_eye
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_camera, stack_from_eye
-from runtime.records import F32, F64, U8
+from runtime.records import F32, F64, U8, Eyes
 
 SETS = 2  # independent sets of rays; the squared error is the product of their errors
 
@@ -26,7 +26,7 @@ SETS = 2  # independent sets of rays; the squared error is the product of their 
 class Sight:
     """Targets for the viewers' eyes, and the eyes' positions."""
 
-    eyes_m: F64  # (V, 3) eyes that the layers were solved for, frame `stack`
+    eyes_m: Eyes  # (V, 3) eyes that the layers were solved for, frame `stack`
     targets: tuple[U8 | F32, ...]  # (h, w, 3) the eyes' pictures
     fov_deg: float  # the pictures' horizontal field of view
     sigma_mm: float = 1.0  # standard deviation of the tracking error along each axis
@@ -108,7 +108,7 @@ def _moves(sight: Sight) -> Iterator[tuple[float, F64]]:
 
 
 class _Eye(NamedTuple):
-    solved_for_m: F64
+    solved_for_m: Eyes
     seen_from_m: F64
     target: F32
     fov_deg: float

@@ -25,7 +25,7 @@ from runtime.evaluation.displayed import displayed, expected_quality
 from runtime.model.predictor import Predictor, load_predictor
 from runtime.model.still import solve_still
 from runtime.optics.stack import PanelStack
-from runtime.records import F64, U8
+from runtime.records import F64, U8, Eyes
 from runtime.report.pairs import eyes_at
 from runtime.report.stability.trial import Answer, Trial
 
@@ -47,7 +47,7 @@ def ready(model: str, stack: PanelStack) -> Predictor:
     return load_predictor(model, stack, ModelSettings(threads=1))
 
 
-def layers_of(model: str, images: Sequence[U8], eyes_m: F64, stack: PanelStack, *, fov_deg: float = FOV_DEG) -> U8:
+def layers_of(model: str, images: Sequence[U8], eyes_m: Eyes, stack: PanelStack, *, fov_deg: float = FOV_DEG) -> U8:
     """Solve a pair of pictures, and return a copy of the layers with shape (N, h, w, 3)."""
     still = solve_still(images[0], images[1], eyes_m=eyes_m, fov_deg=fov_deg, predictor=ready(model, stack))
     return np.array(still.layers[..., :3])
@@ -216,14 +216,13 @@ def smooth(stack: PanelStack) -> list[U8]:
 
 
 def stressed(
-    model: str, images: Sequence[U8], eyes_m: F64, stack: PanelStack = STACK, *, light: bool = False
+    model: str, images: Sequence[U8], eyes_m: Eyes, stack: PanelStack = STACK, *, light: bool = False
 ) -> Answer:
     """Measure the displayed pictures' RMS error.
 
     Args:
         model: Model name.
         images: Target pictures for the left and right eyes, shape (h, w, 3).
-        eyes_m: Left and right eyes, shape (2, 3), in the `stack` frame.
         light: Measure light (docs/contracts.md, Error) rather than one ray per pixel.
     """
     layers = layers_of(model, images, eyes_m, stack)
@@ -251,7 +250,7 @@ def trials(*, full: bool = False) -> Iterator[Trial]:
             yield Trial(SOLVE, f"{model}, {name}", run, measure="of the target", floor=SOLVE_FLOOR)
 
     def case(
-        model: str, name: str, images: Sequence[U8], eyes_m: F64, stack: PanelStack = STACK, *, light: bool = False
+        model: str, name: str, images: Sequence[U8], eyes_m: Eyes, stack: PanelStack = STACK, *, light: bool = False
     ) -> Trial:
         run: Any = partial(stressed, model, images, eyes_m, stack, light=light)
         return Trial(NETWORK, f"{model}: {name}", run, measure="light" if light else "intensity", floor=NETWORK_FLOOR)
