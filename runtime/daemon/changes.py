@@ -91,6 +91,7 @@ class _Loading:
     choose: Callable[[Choices], Choices]  # returns the new choices; called on the reading thread; may raise InputError
     reload_content: bool = False
     reading: BackgroundJob[tuple[Choices, Settings, Calibration]] | None = None  # None: not begun
+    moved: dict[str, Any] = field(default_factory=dict)  # placement sent to the solver before this change was
     choices: Choices | None = None  # once they have been read
     settings: Settings | None = None
     calibration: Calibration | None = None
@@ -175,6 +176,9 @@ class Changes:
         def moved() -> None:
             self.choices = self.choices.choosing("content", **values)
 
+        loading = self._loading
+        if loading is not None and loading.order is None:  # the solver would undo it with what is still being read
+            loading.moved |= values
         self._order(command, Move(values), moved)
 
     def skip(self, command: Command) -> None:
@@ -212,6 +216,9 @@ class Changes:
             self._over(loading, reading.problem)
             return
         loading.choices, loading.settings, loading.calibration = read
+        if loading.settings.content.scene == self._presenter.solver.facts.settings.content.scene:
+            loading.choices = loading.choices.choosing("content", **loading.moved)
+            loading.settings = changed(loading.settings, "content", loading.moved, source="place")
 
         def answered(answer: Answer) -> None:
             if isinstance(answer, Progress):

@@ -20,7 +20,7 @@ from runtime.blackbox.recorder import Recorder
 from runtime.clock import NS_PER_S, MonotonicClock
 from runtime.config import Settings, load_settings
 from runtime.content.placed import PlacedSource
-from runtime.daemon import reconfigure
+from runtime.daemon import changes, reconfigure
 from runtime.daemon import server as server_module
 from runtime.daemon.client import ask
 from runtime.daemon.notify import Notifier
@@ -189,6 +189,23 @@ def test_a_place_given_while_the_scene_is_read_again_stays(served: Served, gate:
         served.rig.presenter.refresh()
     assert answers[0]["ok"] and answers[0]["placing"]["scale"] == 1.5
     assert isinstance(served.rig.content, PlacedSource) and served.rig.content.placing.scale == 1.5
+    assert served.asked("model", "balanced")["placing"]["scale"] == 1.5
+
+
+def test_a_place_given_before_the_settings_are_read_stays(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    real, opened = changes.load_calibration, threading.Event()
+
+    def slow(path: Path | None) -> Any:
+        assert opened.wait(60.0)
+        return real(path)
+
+    monkeypatch.setattr(changes, "load_calibration", slow)
+    first, answers = loading(served, "demo")
+    assert served.asked("place", {"scale": 1.5})["placing"]["scale"] == 1.5
+    opened.set()
+    while first.is_alive():
+        served.rig.presenter.refresh()
+    assert answers[0]["ok"] and answers[0]["placing"]["scale"] == 1.5
     assert served.asked("model", "balanced")["placing"]["scale"] == 1.5
 
 
