@@ -51,81 +51,54 @@ class ContentInfo:
 
 
 class ContentSource(ABC):
-    """Scene that can be drawn for any eye position.
-
-    A source must be created, used and closed on the thread that owns its GL context.
-    """
+    """Scene that can be drawn for any eye position. Create, use and close it on the thread that owns its GL context."""
 
     Options: ClassVar[type[BaseModel]] = Section  # model that validates [content.options] for a user-defined scene
     info: ContentInfo
     draws_in: object = None  # GL context that owns the textures `draw` returns, or None if the source returns arrays
 
     def __init__(self, options: Any, *, stack: Any, context: Any) -> None:
-        """Create a user-defined scene.
-
-        Args:
-            options: Instance of `Options`.
-            stack: The display's panels (`PanelStack`).
-
-        Raises:
-            InputError: The scene cannot be shown.
+        """Create a user-defined scene, given an instance of `Options` and the display's `PanelStack`. Raises InputError
+        if the scene cannot be shown.
         """
         self.info = ContentInfo(type(self).__name__, moving=True, background=None)
 
     @abstractmethod
     def render(self, view: View, *, time_ns: int) -> U8:
-        """Return the eye's picture on the view's raster as an RGBA array (height_px, width_px, 4).
+        """Return the eye's picture on the view's raster as an RGBA array (height_px, width_px, 4), row 0 at the top.
 
-        Row 0 is at the top. Colours are already blended with the background. Alpha is the content's coverage and is 0
-        only where nothing but the background is visible. The array belongs to the source and stays valid until `render`
-        is next called for the same side.
-
-        Args:
-            view: Eye to draw for, and raster to draw on.
-            time_ns: Time on the run's clock, which determines the state of moving content.
-
-        Raises:
-            ContentFailure: The picture cannot be drawn at the moment. The last picture stays on the display.
+        Colours are already blended with the background. Alpha is the content's coverage and is 0 only where nothing but
+        the background is visible. The array is valid until the next call for the same side. `time_ns` is on the run's
+        clock and determines the state of moving content. Raises ContentFailure if the picture cannot be drawn at the
+        moment; the last picture then stays on the display.
         """
 
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture | None:
-        """Return the picture as a texture, or None if the caller must use `render` instead.
-
-        The texture stays valid until the source draws the next picture for the same side. Raises ContentFailure if the
-        picture cannot be drawn at the moment.
+        """Return the picture as a texture, valid until the next for the same side, or None if the caller must use
+        `render`. Raises ContentFailure if the picture cannot be drawn at the moment.
         """
         return None
 
     def nearness(self, view: View, *, every: int, first: tuple[int, int]) -> F32 | None:
-        """Return the inverse distance to the nearest point in each block of pixels, in 1/m.
+        """Return the (h, w) inverse distances to the nearest point in each block of pixels, in 1/m, 0 for the
+        background.
 
-        The latest picture drawn for the view's side is divided into blocks. Distances are measured along the third
-        coordinate of the view's projection.
-
-        Args:
-            view: View that the latest picture was drawn for.
-            every: Side length of the square blocks, in pixels.
-            first: Numbers of columns and rows, less than `every`, that are missing from the first block at its left and
-                top.
-
-        Returns:
-            An (h, w) array with one value per block: 0 where only the background is visible. None if the distances are
-            unknown. In that case, content is aligned to new eye positions as if it were on the middle panel.
+        They belong to the latest picture drawn for the view's side, and are measured along the third coordinate of the
+        view's projection. Blocks are squares of `every` pixels; `first` columns and rows, less than `every`, are
+        missing from the first one. None if the distances are unknown: content is then aligned as if it were on the
+        middle panel.
         """
         return None
 
     def expect(self, views: Sequence[View], *, time_ns: int) -> None:  # noqa: B027 - most have nothing to prepare
-        """Prepare for the views that will be drawn next, usually one for each eye.
-
-        Raises ContentFailure if these views cannot be drawn at the moment.
+        """Prepare for the views that will be drawn next, usually one for each eye. Raises ContentFailure if that fails
+        for now.
         """
 
     @property
     def program(self) -> dict[str, Any] | None:
-        """Status of the program that draws the scene, or None if the source draws the scene itself.
-
-        The keys are `address`, the address that the program connects to, and `frame_ms`, the time that a recent frame
-        took.
+        """Return the `address` that a drawing program connects to and its recent `frame_ms`, or None if there is no
+        program.
         """
         return None
 
@@ -147,9 +120,8 @@ class ContentSource(ABC):
 
     @property
     def problem(self) -> str:
-        """One-line description of the current fault, or an empty string if the source is working.
-
-        The last good picture stays on the display until the fault is resolved.
+        """Describe the current fault in one line, or return an empty string. The last good picture stays on the
+        display.
         """
         return ""
 

@@ -13,18 +13,9 @@ NEAREST_M = 1e-3  # distance from the eye to the near plane
 
 
 def clip_from_stack(view: View, *, near_m: float, far_m: float) -> F64:
-    """Return the 4x4 OpenGL clip matrix for a view.
-
-    The raster's v axis is mapped to +y in OpenGL, which stores the bottom row first. Row 0 of the raster is therefore
-    also row 0 of the pixels read back, and the picture need not be flipped.
-
-    Args:
-        view: View whose projection to convert.
-        near_m: Distance of the near plane (`depth_bounds`).
-        far_m: Distance of the far plane.
-
-    Raises:
-        ValueError: Nothing is in front of the eye.
+    """Return the 4x4 OpenGL clip matrix for a view. Raises ValueError if nothing is in front of the eye. The raster's v
+    axis is mapped to OpenGL's +y, whose rows are stored bottom first, so pictures that are read back need not be
+    flipped.
     """
     if not 0.0 < near_m < far_m:
         raise ValueError(
@@ -43,10 +34,7 @@ def box_corners(low_m: ArrayLike, high_m: ArrayLike) -> F64:
 
 
 def project(pixels_from_stack: F64, points_m: F64) -> tuple[F64, F64]:
-    """Project points (n, 3) in frame `stack` to pixels (n, 2) and depths (n,) in metres.
-
-    Pixel coordinates are undefined for points behind the eye.
-    """
+    """Project points (n, 3) in `stack` to pixels (n, 2), undefined behind the eye, and depths (n,) in metres."""
     # A contiguous row per coordinate makes the arithmetic and the reductions several times as fast.
     homogeneous = pixels_from_stack[:, :3] @ points_m.T + pixels_from_stack[:, 3:]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -54,14 +42,8 @@ def project(pixels_from_stack: F64, points_m: F64) -> tuple[F64, F64]:
 
 
 def covered_box(view: View, points_m: F64, *, align_px: int = 32) -> PixelRect:
-    """Return a pixel box that contains the projected convex hull of the given points.
-
-    The box is empty if all points are behind the eye, and covers the whole raster if some of them are.
-
-    Args:
-        view: View that the points are projected into. The box is clipped to its raster.
-        points_m: Points (n, 3) in frame `stack`.
-        align_px: Enlarge the box to multiples of this number of pixels.
+    """Return a box, in multiples of `align_px`, that contains the convex hull of points (n, 3) in `stack`, within the
+    raster. It is empty if all points are behind the eye, and the whole raster if some of them are.
     """
     pixels, depths = project(view.pixels_from_stack, points_m)
     if _bounds(depths)[1] <= 2 * NEAREST_M:

@@ -59,10 +59,7 @@ class _Target:
 
 
 class _Reducer:
-    """Reduces a depth buffer on the GPU to the nearest value in each block of pixels.
-
-    Reading back the full depth buffer would hold Python's global lock for too long.
-    """
+    """Reduces a depth buffer on the GPU: reading back all of it would hold Python's global lock for too long."""
 
     def __init__(self, context: Any) -> None:
         self._context = context
@@ -80,15 +77,8 @@ class _Reducer:
         at_near: float,
         at_far: float,
     ) -> F32:
-        """Return a (rows, columns) array of values that vary linearly with the smallest depth in each block.
-
-        Args:
-            depth: Depth texture.
-            size: Number of blocks (columns, rows).
-            every: Side length of the square blocks, in pixels.
-            first: Numbers of pixel columns and rows that are missing from the first block at its left and top.
-            at_near: Value for depth 0.
-            at_far: Value for depth 1. If nothing was drawn in a block, its value is 0 instead.
+        """Return values (rows, columns) linear in the smallest depth of each block, from `at_near` to `at_far`, 0 if
+        empty. `size` is in blocks; `every` and `first` are those of `ContentSource.nearness`.
         """
         if size not in self._targets:
             if len(self._targets) >= SIZES_KEPT:
@@ -121,19 +111,14 @@ class _Reducer:
 
 
 class CanvasSource(ContentSource):
-    """Base class for sources that draw with OpenGL into one framebuffer per view size.
-
-    Only the box that the content may cover is drawn and has its multiple samples resolved, because resolving is the
-    most expensive step on a software rasteriser. Pixels are read back only on request.
+    """Base class for sources that draw with OpenGL into one framebuffer per view size. Only the box that the content
+    may cover is drawn and has its multiple samples resolved, because resolving is the most expensive step on a software
+    rasteriser. Pixels are read back only on request.
     """
 
     def __init__(self, context: Any, *, info: ContentInfo, samples: int = 0, deep: bool = False) -> None:
-        """Create the source.
-
-        Args:
-            info: Scene properties.
-            samples: Number of samples per pixel, or 0 for no multisampling.
-            deep: Draw in half floats, for blending many layers when some are brighter than white.
+        """Create the source; `samples` is 0 for no multisampling. `deep` draws in half floats, for blending many layers
+        when some are brighter than white.
         """
         self.info, self.context = info, context
         self.draws_in = context
@@ -152,10 +137,7 @@ class CanvasSource(ContentSource):
         return self.draw(view, time_ns=time_ns).pixels()
 
     def drawn(self, view: View, box: PixelRect, paint: Callable[[], None]) -> DrawnPicture:
-        """Clear a view's framebuffer, call `paint` to draw inside `box`, and return the picture.
-
-        The picture stays valid until another picture is drawn for the same side.
-        """
+        """Clear a view's framebuffer, call `paint` to draw inside `box`, and return the picture."""
         self._bounds[view.side] = None
         target = self._target(view.width_px, view.height_px)
         plain = target.plain[view.side]

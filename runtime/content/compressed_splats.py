@@ -37,10 +37,8 @@ def is_sog_folder(folder: Path) -> bool:
 
 
 def load_compressed_splats(path: Path) -> Gaussians:
-    """Read an SPZ file, a SOG file, or a folder with an unpacked SOG file.
-
-    Raises InputError if the file is damaged, exceeds a limit, has an unsupported version, or contains no visible
-    splats.
+    """Read an SPZ file, a SOG file, or a folder with an unpacked SOG file. Raises InputError if it is damaged, exceeds
+    a limit, has an unsupported version, or contains no visible splats.
     """
     try:
         with np.errstate(all="ignore"):
@@ -53,11 +51,7 @@ def load_compressed_splats(path: Path) -> Gaussians:
 
 
 def _spz(path: Path) -> Gaussians:
-    """Read an SPZ file.
-
-    The file stores the positions of all splats first, then all opacities, then all colours, scales, rotations and
-    harmonics.
-    """
+    """Read an SPZ file: the positions of all splats, then all opacities, colours, scales, rotations and harmonics."""
     data = untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)
     zipped = zlib.decompressobj(31) if data[:2] == b"\x1f\x8b" else None
     head = zipped.decompress(data, SPZ_SHORT) if zipped else data[: SPZ_HEADER.size]
@@ -88,12 +82,8 @@ def _spz(path: Path) -> Gaussians:
 
 
 def _zstd_blocks(data: bytes, table: int, sizes: list[int]) -> list[bytes]:
-    """Decompress a version 4 SPZ file's streams. Empty streams may be missing from the file.
-
-    Args:
-        data: The file's contents.
-        table: Byte offset of the table that lists the stream sizes.
-        sizes: Expected size of each stream, in bytes. No stream is decompressed beyond this size.
+    """Decompress a version 4 SPZ file's streams, listed in a `table` at a byte offset, up to the expected sizes in
+    bytes. Empty streams may be missing from the file.
     """
     import zstandard
 
@@ -120,10 +110,8 @@ def _three_bytes(turns: U8) -> F32:
 
 
 def _four_bytes(turns: U32) -> F32:
-    """Decode packed 32-bit words (n,) into quaternions (n, 4) in w, x, y, z order.
-
-    The top two bits of each word give the index of the largest component, in x, y, z, w order. The other three
-    components follow, each stored as a sign bit and a 9-bit magnitude.
+    """Decode packed 32-bit words (n,) into quaternions (n, 4), w, x, y, z. The top two bits are the index of the
+    largest component, in x, y, z, w order. The other three follow, each with a sign bit and a 9-bit magnitude.
     """
     share = fields_of(turns, (1, 9, 1, 9, 1, 9))
     three = (1 - 2 * share[:, ::2]) * share[:, 1::2] * np.float32(np.sqrt(0.5))
@@ -131,10 +119,8 @@ def _four_bytes(turns: U32) -> F32:
 
 
 def _sog(path: Path) -> Gaussians:
-    """Read a SOG file or folder.
-
-    SOG stores the splats' properties in pictures with one pixel per splat. A pixel's bytes are either fractions of a
-    range or indices into a codebook.
+    """Read a SOG file or folder: pictures with one pixel per splat, whose bytes are fractions of a range or codebook
+    indices.
     """
     with _SogFiles(path) as files:
         meta = untrusted_input.parsed_json(files.read("meta.json"), source=path)

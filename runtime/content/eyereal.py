@@ -49,16 +49,9 @@ def is_data_set(folder: Path) -> bool:
 def read_folder(folder: Path, preset: str) -> tuple[Pair, ...]:
     """Return all pairs in a folder, ordered by number.
 
-    File names contain the eyes' positions in the scene's digital units. These positions determine whether `_0` or `_1`
-    is the left picture. The names `_left` and `_right` in newer data must agree with the positions.
-
-    Args:
-        folder: Folder that contains the pictures.
-        preset: Scene name.
-
-    Raises:
-        InputError: There are no pairs, a pair is incomplete, an eye is behind the display, or a pair's left and right
-            pictures cannot be told apart.
+    File names contain the eyes' positions in the scene's digital units, which determine whether `_0` or `_1` is the
+    left picture, and with which `_left` and `_right` in newer data must agree. Raises InputError if there are no pairs,
+    a pair is incomplete or ambiguous, or an eye is behind the display.
     """
     stack_from_scene: F64 = np.linalg.inv(drawn_scene_from_stack(preset)).astype(np.float64)
     files: dict[int, list[tuple[str, Path, F64]]] = {}
@@ -93,10 +86,8 @@ def read_folder(folder: Path, preset: str) -> tuple[Pair, ...]:
 
 
 def prepare(file: SceneFile) -> Callable[..., ContentSource]:
-    """Read a folder of pairs, and return a function that creates the source.
-
-    Uses the chosen preset or, by default, the preset whose name occurs in the folder's name. Raises InputError if there
-    is no such preset, or if the pairs cannot be read.
+    """Read a folder of pairs, and return a function that creates the source. By default, the preset is that whose name
+    occurs in the folder's name. Raises InputError if there is none, or if the pairs cannot be read.
     """
     path, settings = file.path, file.settings
     name = file.preset or next((name for name in preset_names() if name in path.resolve().name), "")
@@ -114,10 +105,7 @@ def prepare(file: SceneFile) -> Callable[..., ContentSource]:
 
 
 class EyeRealSource(ContentSource):
-    """Source that shows the pair whose left eye is nearest to the viewer's left eye.
-
-    The pictures are warped to the viewer's eyes as if they were on the plane x = 0, at the centre of the display.
-    """
+    """Source that shows the pair whose left eye is nearest to the viewer's left eye, warped as if at x = 0."""
 
     def __init__(
         self,

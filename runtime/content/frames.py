@@ -41,11 +41,7 @@ SKIPPED = 60  # most frames that are decoded in passing instead of seeking
 
 
 class Frames(ABC):
-    """Sequence of pictures that is played in a loop.
-
-    Constructors raise InputError if the files cannot be shown. If a picture cannot be decoded later on, `frame` raises
-    ContentFailure.
-    """
+    """Sequence of pictures that is played in a loop. Constructors raise InputError if the files cannot be shown."""
 
     count: int  # number of pictures
     rate_hz: float  # pictures per second
@@ -53,9 +49,8 @@ class Frames(ABC):
 
     @abstractmethod
     def frame(self, index: int) -> U8:
-        """Return the frame at `index` as an RGB picture (h, w, 3) containing every view in the layout.
-
-        Raises ContentFailure if the picture cannot be decoded.
+        """Return the frame at `index`, with every view in the layout, as RGB (h, w, 3). Raises ContentFailure if that
+        fails.
         """
 
     def layout(self, index: int) -> Layout:
@@ -70,21 +65,12 @@ class Frames(ABC):
 
 
 class PictureFiles(Frames):
-    """Sequence of still pictures, one per file.
-
-    If a file contains two views and both are shown, the views are joined side by side.
-    """
+    """Sequence of still pictures, one per file. Two views in a file, if both are shown, are joined side by side."""
 
     def __init__(self, paths: Sequence[Path], settings: ContentSettings, *, folder: Path | None = None) -> None:
-        """Read the headers of all pictures, and decode the first picture that can be decoded.
-
-        Args:
-            paths: Picture files, in order.
-            folder: Folder that contains the pictures, or None for a single file. Films in a folder, files with headers
-                that cannot be read, and pictures at the start that cannot be decoded are skipped and logged.
-
-        Raises:
-            InputError: No file can be used.
+        """Read the headers of all pictures in order, and decode the first picture that can be decoded. Without
+        `folder`, there is a single file. In a folder, films, unreadable headers and faulty pictures at the start are
+        skipped and logged. Raises InputError if no file can be used.
         """
         self._background = settings.background or DARK
         self.layouts, self._paths, refused = [], [], []
@@ -151,15 +137,7 @@ class Video(Frames):
     """The frames of a film, decoded during playback and each shown at its own time."""
 
     def __init__(self, path: Path, settings: ContentSettings, times_ns: NDArray[np.int64] | None = None) -> None:
-        """Open a film and decode its first frame.
-
-        Args:
-            path: Film file.
-            times_ns: The frames' times, if they are known; see `Film`.
-
-        Raises:
-            InputError: The film cannot be decoded.
-        """
+        """Open a film, with its frames' times if known, and decode its first frame. Raises InputError if that fails."""
         from runtime.support.film import Film  # noqa: PLC0415 - PyAV is in an extra
 
         self._film, self._settings = Film(path, times_ns=times_ns), settings
@@ -205,11 +183,8 @@ class Video(Frames):
 
 
 def layout_in(header: Header, path: Path, settings: ContentSettings, folder: Path | None = None) -> Layout:
-    """Return a picture's layout.
-
-    If a file contains two views, its layout is side by side, unless the settings request a single view or the
-    cross-eyed order. Otherwise, the layout follows from the settings, the header, or the name of the file or of
-    `folder`.
+    """Return a picture's layout, from the settings, the header, or the name of the file or of `folder`. Two views in a
+    file are side by side, unless the settings request a single view or the cross-eyed order.
     """
     layout = layout_of(path, settings, stated=header.layout)
     if header.is_around:
@@ -222,10 +197,7 @@ def layout_in(header: Header, path: Path, settings: ContentSettings, folder: Pat
 
 
 def open_frames(path: Path, settings: ContentSettings) -> Frames:
-    """Open a picture, an animation, a video or a folder of pictures.
-
-    Raises InputError if the file cannot be shown, or if the folder contains no pictures that can.
-    """
+    """Open a picture, an animation, a video or a folder of pictures. Raises InputError if nothing can be shown."""
     if not path.is_dir():
         if path.suffix.lower() in VIDEOS:
             return Video(path, settings)
@@ -275,10 +247,8 @@ def _why_none(folder: Path) -> str:
 
 
 def read_pair(path: Path, settings: ContentSettings) -> list[U8]:
-    """Read the left and right eye's views from one file.
-
-    The views are resized to square pixels, and transparent areas become white. Raises InputError if the file cannot be
-    read, or if it does not contain exactly two views.
+    """Read the left and right eye's views from one file, with square pixels, and white where they are transparent.
+    Raises InputError if the file cannot be read, or if it does not contain exactly two views.
     """
     views = read_views(path)
     if len(views) == 2:

@@ -72,17 +72,11 @@ def edges_of(shape: Shape) -> Edges:
 
 
 class OutlineRamps:
-    """Builds ramps along the outlines of parts.
-
-    A ramp is a quadrilateral whose coverage falls from 1 at the edge to 0 outside the outline.
-    """
+    """Builds ramps along outlines: quadrilaterals whose coverage falls from 1 at the edge to 0 outside the outline."""
 
     def __init__(self, parts: Mapping[int, tuple[Edges, F32]]) -> None:
-        """Prepare to build ramps.
-
-        Args:
-            parts: For each part, by number, its edges and its vertices (v, 12). A vertex consists of its position in
-                the part's frame (3), and attributes that the ramps' corners take from it.
+        """Prepare ramps for parts, by number: edges, and vertices (v, 12) of a position in the part's frame and
+        attributes.
         """
         self._parts = {number: _outlined(*part) for number, part in parts.items()}
         self._ramps = np.empty((sum(len(edges.faces) for edges, _ in parts.values()), 4, CORNER_FLOATS), np.float32)
@@ -90,20 +84,13 @@ class OutlineRamps:
     def along(
         self, seen: Sequence[tuple[int, F64, F64]], *, width_px: int, height_px: int, ramp_px: float = 1.0
     ) -> tuple[F32, list[int]]:
-        """Return the ramps along the outlines of parts.
+        """Return ramps (m, 4, CORNER_FLOATS) along the outlines of parts, valid until the next call, and each part's
+        number.
 
-        An edge gets no ramp if it is partly behind the eye or too short to have a direction.
-
-        Args:
-            seen: The parts in the order in which to return their ramps. For each, its number, the eye (3,) in the
-                part's frame, and its 4x4 clip matrix. The parts' normals must point outwards.
-            ramp_px: Ramp width in pixels.
-
-        Returns:
-            Ramps (m, 4, CORNER_FLOATS), valid until the next call, and how many of them each part has. Each ramp has
-            two corners on its edge and then two outside the outline. A corner consists of clip coordinates (4),
-            coverage, and the attributes (9) of the edge's vertex nearest to it. `TRIANGLES` states which
-            corners form a ramp's two triangles.
+        `seen` lists the parts in the order of drawing: number, the eye (3,) in the part's frame, and its 4x4 clip
+        matrix. Normals must point outwards. A ramp has two corners on its edge and then two outside the outline: clip
+        coordinates (4), coverage, and the attributes (9) of the edge's nearest vertex, for the two triangles of
+        `TRIANGLES`. An edge gets no ramp if it is partly behind the eye or too short to have a direction.
         """
         counts: list[int] = []
         for number, eye, clip_from_part in seen:

@@ -45,16 +45,8 @@ class GltfScene:
     """Loads a glTF file's scene as parts and points, and records any features that are not drawn."""
 
     def __init__(self, path: Path, data: bytes, read: Read, origin: Origin) -> None:
-        """Load a scene.
-
-        Args:
-            path: Scene file.
-            data: The file's contents, as glTF or GLB.
-            read: Function that reads other files the scene refers to.
-            origin: Origin of the parts and points.
-
-        Raises:
-            InputError: The file is not glTF 2.0, is damaged, exceeds a limit, or requires an unsupported extension.
+        """Load a scene from glTF or GLB data; `read` reads other files, and parts and points are relative to `origin`.
+        Raises InputError if it is not glTF 2.0, is damaged, exceeds a limit, or requires an unsupported extension.
         """
         self.path, self._origin = path, origin
         self._hidden: set[int] = set()  # numbers of the invisible nodes
@@ -121,10 +113,8 @@ class GltfScene:
         self.left_out |= {str(name) for name in file.table.get("extensionsUsed", [])} - DRAWN - UNSEEN - {*COMPRESSED}
 
     def _world(self) -> dict[int, tuple[Table, F64]]:
-        """Return the scene's nodes by number, each with its 4x4 scene_from_node matrix.
-
-        Invisible nodes are included, because they may be joints, and recorded in `_hidden`. Raises InputError if nodes
-        are nested too deeply.
+        """Return the scene's nodes by number, each with its 4x4 scene_from_node matrix. Invisible nodes are included,
+        because they may be joints, and recorded in `_hidden`. Raises InputError if nodes are nested too deeply.
         """
         nodes, scenes = self.file.all("nodes"), self.file.all("scenes")
         children = {child for node in nodes for child in node.get("children", [])}
@@ -156,12 +146,8 @@ class GltfScene:
         return np.asarray(stand @ columns[: len(stand)].transpose(0, 2, 1))
 
     def _add(self, primitive: Table, *, weights: list[float], matrices: F64) -> None:
-        """Add a primitive's triangles, lines or points to the scene.
-
-        Args:
-            primitive: Primitive as described in the file.
-            weights: Weights for the primitive's morph targets.
-            matrices: The scene_from_mesh matrix (4, 4) or, for a skinned mesh, one matrix per joint (j, 4, 4).
+        """Add a primitive's triangles, lines or points, with weights of its morph targets. `matrices`: scene_from_mesh
+        (4, 4) or, for a skinned mesh, one per joint (j, 4, 4).
         """
         file, mode = self.file, primitive.get("mode", TRIANGLES)
         if "POSITION" not in primitive["attributes"]:
@@ -215,12 +201,7 @@ class GltfScene:
         self.parts.append(Part(shape, vertex_colours=colours, is_linear=not is_plain, **look))
 
     def _skinned(self, joints: F64, attribute: Any) -> F64:
-        """Return one matrix per vertex (v, 4, 4), each a weighted mean of the joints' matrices.
-
-        Args:
-            joints: The joints' matrices (j, 4, 4).
-            attribute: Function that returns the vertex attribute with a given name, or None if it is missing.
-        """
+        """Return one matrix per vertex (v, 4, 4), each a weighted mean of the joints' matrices (j, 4, 4)."""
         names, weights = attribute("JOINTS_0"), attribute("WEIGHTS_0")
         for number in range(1, 4):
             if (more := attribute(f"JOINTS_{number}")) is not None:
@@ -233,10 +214,9 @@ class GltfScene:
         return total
 
     def _draco(self, primitive: Table) -> tuple[dict[str, Array], Array | None]:
-        """Decode the attributes and vertex indices of a primitive compressed with Draco.
-
-        Returns an empty dict and None if the primitive is not compressed, or if DracoPy is not installed but the file
-        also contains the data uncompressed. Raises InputError if compressed data are needed but cannot be decoded.
+        """Decode the attributes and vertex indices of a primitive compressed with Draco. Empty if the primitive is not
+        compressed, or if DracoPy is not installed but the file also has the data uncompressed. Raises InputError if
+        compressed data are needed but cannot be decoded.
         """
         own = primitive.get("extensions", {}).get(DRACO)
         if own is None:
@@ -263,10 +243,8 @@ class GltfScene:
         return values, np.asarray(decoded.faces).reshape(-1)
 
     def _look(self, index: int | None) -> tuple[dict[str, Any], Table]:
-        """Convert a material to `Part` fields, with linear colours.
-
-        Returns:
-            The fields, and the material's texture reference, which states which texture coordinates to use.
+        """Convert a material to `Part` fields, with linear colours, and return its texture reference, which names
+        coordinates.
         """
         file, material = self.file, {} if index is None else self.file.item("materials", index)
         own = material.get("extensions", {})
@@ -325,9 +303,8 @@ def _local(node: Table) -> F64:
 
 
 def _faces(corners: Array, mode: int) -> Array:
-    """Group vertex indices into triangles (t, 3), lines (n, 2) or points (n,), depending on the mode.
-
-    Section 3.7.2.1 defines the modes. Raises ValueError if the mode is unknown.
+    """Group indices into triangles (t, 3), lines (n, 2) or points (n,) (section 3.7.2.1). Raises ValueError for other
+    modes.
     """
     corners = np.asarray(corners).astype(np.int64)
     if mode == POINTS:

@@ -43,10 +43,8 @@ WAY_OUT = "save the model without that compression, with Blender or `gltf-transf
 
 
 class GltfFile:
-    """Reads objects in a glTF 2.0 file by number.
-
-    All methods raise LookupError, TypeError or ValueError if the file is malformed, and InputError if data are missing,
-    unsupported or larger than a limit.
+    """Reads objects in a glTF 2.0 file by number. All methods raise LookupError, TypeError or ValueError if the file is
+    malformed, and InputError if data are missing, unsupported or larger than a limit.
     """
 
     def __init__(self, path: Path, data: bytes, read: Read) -> None:
@@ -77,12 +75,8 @@ class GltfFile:
         return _count(self.item("accessors", accessor))
 
     def accessor(self, index: int, *, rows: Array | None = None, as_float: bool = True) -> Array:
-        """Return an accessor's elements (n, ...).
-
-        Args:
-            index: Accessor number.
-            rows: Indices of the elements to return. By default, all elements are returned.
-            as_float: Convert the elements to float32 with `fractions`. If False, numbers are returned as stored.
+        """Return an accessor's elements (n, ...), all or those of `rows`, as float32 by `fractions` unless `as_float`
+        is False.
         """
         accessor = self.item("accessors", index)
         values = self._stored(accessor)
@@ -151,9 +145,8 @@ class GltfFile:
             raise ValueError(f"a data URI is not valid base64: {error}") from None
 
     def picture(self, texture: Table) -> U8:
-        """Return a texture's picture as an RGBA array (h, w, 4).
-
-        Call `check_pictures` first. Raises InputError if the picture cannot be decoded.
+        """Return a texture's picture as RGBA (h, w, 4). Call `check_pictures` first. Raises InputError if it cannot be
+        decoded.
         """
         number = self._image_of(texture)
         if number not in self._pictures:
@@ -162,10 +155,7 @@ class GltfFile:
         return self._pictures[number]
 
     def check_pictures(self, textures: list[Table]) -> None:
-        """Check the headers of all pictures before any picture is decoded.
-
-        Raises InputError if one picture, or all pictures together, have too many pixels.
-        """
+        """Check all pictures' headers. Raises InputError if one picture, or all together, have too many pixels."""
         pixels = 0
         for number in sorted({self._image_of(texture) for texture in textures}):
             coded = self._coded(number)
@@ -176,9 +166,8 @@ class GltfFile:
             untrusted_input.within(pixels, LIMITS.texture_pixels, source=self.path, field="textures' pixels")
 
     def _image_of(self, texture: Table) -> int:
-        """Return the number of a texture's image, preferring images in formats added by extensions.
-
-        Raises InputError if the texture has no image in a supported format.
+        """Return the number of a texture's image, preferring formats added by extensions. Raises InputError if none is
+        supported.
         """
         own: Table = texture.get("extensions", {})
         for offered in (*(own[name] for name in PICTURE_EXTENSIONS if name in own), texture):
@@ -211,10 +200,7 @@ def _count(accessor: Table) -> int:
 
 
 def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes]:
-    """Return a GLB file's JSON text and binary buffer.
-
-    Chunks of other types are skipped (section 4.4.3). Raises InputError if the file is cut off.
-    """
+    """Return a GLB file's JSON text and binary buffer (section 4.4.3). Raises InputError if the file is cut off."""
     if int.from_bytes(data[4:8], "little") == 1:
         raise InputError(path, "asset.version", VERSION_1)
     size = int.from_bytes(data[12:16], "little")

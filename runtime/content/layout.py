@@ -1,8 +1,4 @@
-"""Determine how views are arranged in a picture.
-
-The arrangement is taken from settings, file headers or file names. If a picture's halves are similar, this gives a
-hint.
-"""
+"""Arrangement of views in a picture, taken from settings, file headers or names; similar halves give a hint."""
 
 from __future__ import annotations
 
@@ -59,11 +55,7 @@ class Layout:
     sample_aspect: float = 1.0  # width over height of a film's pixels
 
     def views(self, picture: U8) -> list[U8]:
-        """Split a picture into its views, ordered as in `parts`. Equirectangular views are cropped.
-
-        The crop keeps the part of each view that is straight ahead. Raises ValueError if the picture is smaller than
-        one pixel per view.
-        """
+        """Split a picture into its views, as `parts` does, and crop equirectangular ones to what is straight ahead."""
         parts = self.parts(picture)
         height, width = parts[0].shape[:2]
         squeezed = (1.0, 0.5, 2.0) if len(parts) == 2 else (1.0,)  # names need not state that views are squeezed
@@ -72,10 +64,8 @@ class Layout:
         return [ahead(part, self.span_deg) for part in parts]
 
     def parts(self, picture: U8) -> list[U8]:
-        """Split a picture into its views, without cropping them.
-
-        Returns [left, right], a single view, or a quilt's views from the leftmost to the rightmost camera. Raises
-        ValueError if the picture is smaller than one pixel per view.
+        """Split a picture into [left, right], a single view, or a quilt's views from the leftmost to the rightmost
+        camera. Raises ValueError if the picture is smaller than one pixel per view.
         """
         height, width = picture.shape[:2]
         if not 0 < self.columns <= width or not 0 < self.rows <= height:
@@ -108,14 +98,8 @@ MONO, PAIR = Layout("mono"), Layout("side-by-side", columns=2)  # PAIR is for fi
 
 
 def layout_of(path: Path, settings: ContentSettings, *, stated: str = "") -> Layout:
-    """Return a file's layout, taken from the settings, its header or its name, in that order.
-
-    Args:
-        path: File or folder. Its name may state the layout.
-        stated: Layout declared by the file's header, in the syntax of `content.layout`, or an empty string.
-
-    Raises:
-        InputError: A quilt has no views, or an implausible aspect ratio.
+    """Return a file's or folder's layout from the settings, its header (`stated`, as in `content.layout`) or its name.
+    Raises InputError if a quilt has no views, or an implausible aspect ratio.
     """
     named = settings.layout
     if named == "auto":
@@ -136,13 +120,8 @@ def layout_of(path: Path, settings: ContentSettings, *, stated: str = "") -> Lay
 
 
 def of_film(layout: Layout, path: Path, *, width_px: int, height_px: int) -> Layout:
-    """Return a film's layout, with squeezed views if the frame has the shape of a single view.
-
-    Args:
-        layout: Layout stated by the film's name or header.
-        path: Film file. A mark such as `full` in its name means that the views are not squeezed.
-        width_px: Frame width.
-        height_px: Frame height.
+    """Return a film's layout, with squeezed views if the frame has the shape of a single view. A mark such as `full` in
+    its name means that the views are not squeezed.
     """
     aspect = width_px / height_px
     squeezed = {"side-by-side": aspect < NARROW, "top-bottom": aspect > LOW}.get(layout.kind, False)
@@ -174,9 +153,8 @@ def _span_deg(path: Path) -> int:
 
 
 def hint(picture: U8) -> str:
-    """Return a picture's probable layout, or an empty string.
-
-    A picture's halves are probably two views if they correlate after a small shift.
+    """Return a picture's probable layout, or an empty string: its halves may be views if they correlate after a small
+    shift.
     """
     for layout in ("side-by-side", "top-bottom"):
         columns = 2 if layout == "side-by-side" else 1
@@ -193,9 +171,6 @@ def hint(picture: U8) -> str:
 
 
 def _detail(view: U8) -> F32:
-    """Reduce a view to a small grey picture for comparison.
-
-    The picture is high-pass filtered, because smooth areas such as skies always look alike.
-    """
+    """Reduce a view to a small grey picture for comparison, high-pass filtered because smooth areas look alike."""
     small = cv2.cvtColor(cv2.resize(view, SMALL_PX, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
     return np.asarray(small.astype(np.float32) - cv2.GaussianBlur(small, (0, 0), 8).astype(np.float32), np.float32)

@@ -1,4 +1,4 @@
-"""Show live pictures, such as those of a video player, with a view for each eye.
+"""Live pictures, such as those of a video player, with a view for each eye.
 
 A feed's thread keeps the newest picture. The solver never waits for it.
 """

@@ -47,10 +47,8 @@ class MeshData:
 
 
 def prepare(file: SceneFile) -> Callable[..., ContentSource]:
-    """Read a mesh file, and return a function that creates the source in a GL context.
-
-    The edges of small meshes are found at this stage, because doing so needs no GL context. Raises InputError if the
-    mesh cannot be drawn.
+    """Read a mesh file, and return a function that creates the source in a GL context. Raises InputError if that fails.
+    The edges of small meshes are found at this stage, because doing so needs no GL context.
     """
     data = load_mesh(file.path)
     if data.left_out:
@@ -71,9 +69,8 @@ def prepare(file: SceneFile) -> Callable[..., ContentSource]:
 
 
 def load_mesh(path: Path) -> MeshData:
-    """Read a mesh file.
-
-    Raises InputError if the file is damaged, exceeds a limit, has non-finite coordinates, or contains nothing to draw.
+    """Read a mesh file. Raises InputError if it is damaged, exceeds a limit, is not finite, or contains nothing to
+    draw.
     """
     progress.tell(f"reading {path.name}", 0)
     data = untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)
@@ -122,13 +119,9 @@ def load_mesh(path: Path) -> MeshData:
 
 
 def folder_reader(path: Path, field: str) -> Callable[[str], bytes]:
-    """Return a function that reads the files a mesh refers to by URI or path.
-
-    The function keeps the contents of each file in memory. It raises InputError if a reference is not a relative path
-    to a file in the folder of the mesh or below, or if the file cannot be read.
-
-    Args:
-        field: Kind of reference, for error messages.
+    """Return a function that reads, once, the files a mesh refers to by URI or path; `field` names the kind of
+    reference. It raises InputError if a reference is not a relative path to a readable file in the mesh's folder or
+    below.
     """
     read_files: dict[str, bytes] = {}
 
@@ -142,10 +135,8 @@ def folder_reader(path: Path, field: str) -> Callable[[str], bytes]:
 
 
 def _file_of(uri: str, *, source: Path, field: str) -> Path:
-    """Return the path of the file that a URI or relative path in the file `source` refers to.
-
-    Raises InputError if the URI has a scheme, the path is absolute or leads out of the source's folder, or the file
-    does not exist.
+    """Return the path of the file that a URI or relative path in the file `source` refers to. Raises InputError if the
+    URI has a scheme, the path is absolute or leads out of the folder, or the file is missing.
     """
     shown = untrusted_input.shown(uri, most=200)
     if "://" in uri or uri.startswith("data:"):

@@ -36,10 +36,9 @@ DRIVE = re.compile(r"[A-Za-z]:.*/")  # folder on the author's Windows machine, w
 
 
 class FolderResolver(trimesh.resolvers.FilePathResolver):
-    """Resolver that trimesh's loaders use to read the files a mesh refers to.
-
-    A missing material file is replaced by an empty file, and a missing texture by a grey one. Other problems are stored
-    in `refused`, because the loaders discard exceptions.
+    """Resolver that trimesh's loaders use to read the files a mesh refers to. A missing material file is replaced by an
+    empty file, and a missing texture by a grey one. Other problems are stored in `refused`, because the loaders discard
+    exceptions.
     """
 
     def __init__(self, path: Path, read: Read, *, has_materials: bool) -> None:
@@ -70,10 +69,8 @@ class FolderResolver(trimesh.resolvers.FilePathResolver):
         return data
 
     def _named(self, name: str) -> str | None:
-        """Return the name of an existing file in the mesh's folder, or None if no file matches.
-
-        The given name may contain MTL options or a Windows path. Raises InputError if the name is an absolute path or
-        leads out of the folder.
+        """Return the name of a file in the mesh's folder, which may come with MTL options or as a Windows path, or
+        None. Raises InputError if the name is an absolute path or leads out of the folder.
         """
         name = DRIVE.sub("", OPTIONS.sub("", name, count=1).strip().replace("\\", "/"))
         within = untrusted_input.path_within_folder(name, source=self._path, field="texture")
@@ -82,18 +79,8 @@ class FolderResolver(trimesh.resolvers.FilePathResolver):
 
 
 def read_mesh(path: Path, data: bytes, read: Read, origin: Origin) -> tuple[list[Part], list[tuple[F32, F32]]]:
-    """Convert a mesh file's triangles to parts, and its points or lines to coloured points.
-
-    Args:
-        data: The file's contents.
-        read: Function that reads other files the mesh refers to.
-        origin: Origin of the parts and points.
-
-    Returns:
-        The parts, and the points as pairs of positions (n, 3) and colours (n, 3).
-
-    Raises:
-        InputError: The file is damaged, or a file it refers to cannot be used.
+    """Convert a mesh file's triangles to parts, and its points or lines to positions (n, 3) and colours (n, 3). `read`
+    reads other files; `origin` is subtracted. Raises InputError if a file is damaged or missing.
     """
     kind = path.suffix.lower().removeprefix(".")
     progress.tell(f"{path.name}: triangles", 0)
@@ -142,10 +129,7 @@ def _without_comments(path: Path, kind: str, data: bytes) -> bytes:
 
 
 def _text(data: bytes) -> str:
-    """Decode an OBJ file encoded in UTF-16 or UTF-8, without the comments behind numbers.
-
-    Invalid characters are replaced. This is harmless, because only names and comments can contain non-ASCII characters.
-    """
+    """Decode an OBJ file, UTF-16 or UTF-8, without comments behind numbers; replace invalid characters of names."""
     return BEHIND_NUMBERS.sub(r"\1", data.decode("utf-16" if data[:2] in BOMS else "utf-8", errors="replace"))
 
 
@@ -179,16 +163,9 @@ def _points(cloud: Any, origin: Origin) -> list[tuple[F32, F32]]:
 
 
 def _part(mesh: Any, matrix: F64, path: Path, pictures: dict[int, U8], origin: Origin) -> Part:
-    """Convert a trimesh mesh to a part with a material, with vertex or face colours, or in plain grey.
-
-    Args:
-        mesh: Mesh loaded by trimesh.
-        matrix: Matrix (4, 4) from the mesh's frame to the scene's.
-        pictures: Textures converted so far, keyed by the `id` of their material. The dict is updated.
-        origin: Origin of the part.
-
-    Raises:
-        InputError: A face is not a triangle of existing vertices.
+    """Convert a trimesh mesh to a part with a material, with vertex or face colours, or in plain grey. `pictures`: the
+    textures converted so far, by their material's `id`; updated. Raises InputError if a face is not a triangle of
+    existing vertices.
     """
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,) or faces.min() < 0 or faces.max() >= len(vertices):
@@ -229,10 +206,8 @@ def _unit(colours: Any) -> F32:
 
 
 def _material(material: Any, pictures: dict[int, U8]) -> tuple[U8 | None, Colour, float]:
-    """Return a material's RGBA texture, the colour that multiplies the texture, and the opacity.
-
-    A black material with a texture is treated as white, because some exporters write black for materials that consist
-    only of a texture.
+    """Return a material's RGBA texture, the colour that multiplies the texture, and the opacity. Black with a texture
+    is treated as white, which some exporters write for materials that consist only of a texture.
     """
     image, diffuse = getattr(material, "image", None), getattr(material, "diffuse", None)
     red, green, blue = _unit(np.ones(3) if diffuse is None else diffuse)[:3].tolist()
@@ -245,10 +220,7 @@ def _material(material: Any, pictures: dict[int, U8]) -> tuple[U8 | None, Colour
 
 
 def _opacity(fields: dict[str, Any]) -> float:
-    """Return the opacity of a material from an MTL file: `d`, or 1 - `Tr`.
-
-    Returns 1 if the opacity is missing, invalid or 0.
-    """
+    """Return the opacity of a material from an MTL file: `d`, or 1 - `Tr`; 1 if it is missing, invalid or 0."""
     for name, sign, start in (("d", 1.0, 0.0), ("tr", -1.0, 1.0)):
         try:
             value = start + sign * float(fields[name][-1])

@@ -23,10 +23,8 @@ U32 = NDArray[np.uint32]
 
 @np.errstate(all="ignore")
 def load_compressed(header: PlyHeader) -> Gaussians:
-    """Read a PLY file compressed by SuperSplat.
-
-    The file stores 8- to 11-bit numbers, each a fraction of the range between the bounds for a chunk of splats. Raises
-    InputError if the file is damaged, bounds or harmonics are missing for some splats, or no splat is visible.
+    """Read a PLY file compressed by SuperSplat: 8- to 11-bit fractions of the bounds of a chunk of splats. Raises
+    InputError if it is damaged, bounds or harmonics are missing for some splats, or no splat is visible.
     """
     elements = read_elements(header)
     splats, bounds = elements["vertex"], elements.get("chunk")
@@ -66,10 +64,8 @@ def load_compressed(header: PlyHeader) -> Gaussians:
 
 @np.errstate(all="ignore")
 def load_splat(path: Path) -> Gaussians:
-    """Read a .splat file, which stores position, scale, RGBA colour and rotation in 32 bytes per splat.
-
-    Raises InputError if the file is empty, has a size that is not a multiple of 32 bytes, or contains no visible
-    splats.
+    """Read a .splat file: position, scale, RGBA colour and rotation in 32 bytes per splat. Raises InputError if its
+    size is not a positive multiple of 32 bytes, or no splat is visible.
     """
     data = untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)
     if not data or len(data) % SPLAT.itemsize:
@@ -91,14 +87,7 @@ def load_splat(path: Path) -> Gaussians:
 
 
 def fields_of(packed: U32, bits: tuple[int, ...]) -> F32:
-    """Unpack bit fields from words and scale each by its maximum value.
-
-    The result is fractions of shape (n, len(bits)).
-
-    Args:
-        packed: Words (n,).
-        bits: Width of each field in bits, highest field first.
-    """
+    """Unpack bit fields, highest first and `bits` wide, of words (n,) to fractions of their maxima (n, len(bits))."""
     parts = []
     for width in reversed(bits):
         most = (1 << width) - 1
@@ -112,19 +101,15 @@ def _between(share: F32, low: F32, high: F32) -> F32:
 
 
 def _turns(packed: U32) -> F32:
-    """Decode packed words (n,) into quaternions (n, 4) in w, x, y, z order.
-
-    The top two bits of each word give the index of the largest component, which is not stored.
+    """Decode packed words (n,) into quaternions (n, 4), w, x, y, z; the top two bits name the component that is not
+    stored.
     """
     return with_largest((fields_of(packed, (10, 10, 10)) - np.float32(0.5)) * np.float32(np.sqrt(2)), packed >> 30)
 
 
 def with_largest(three: NDArray[np.floating[Any]], number: NDArray[np.integer[Any]]) -> F32:
-    """Return unit quaternions (n, 4), computing each one's largest component from the other three.
-
-    Args:
-        three: The components (n, 3) of each quaternion except the largest.
-        number: Index (n,) of each largest component. If an index is above 3, the quaternion is zero.
+    """Return unit quaternions (n, 4) from three components each (n, 3), and the index (n,) of the missing, largest one.
+    If an index is above 3, the quaternion is zero.
     """
     largest = np.sqrt(np.maximum(1 - (three**2).sum(1), 0))
     quaternions = np.zeros((len(three), 4), np.float32)

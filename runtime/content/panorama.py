@@ -20,20 +20,14 @@ def is_around(width: float, height: float, span_deg: int) -> bool:
 
 
 def ahead(view: U8, span_deg: int) -> U8:
-    """Return the middle of an equirectangular view (h, w, 3), reprojected to a pinhole camera.
-
-    The result has about the same resolution as the view.
-    """
+    """Return the middle of an equirectangular view (h, w, 3), reprojected to a pinhole camera of similar resolution."""
     u, v = _places(view.shape[1], view.shape[0], span_deg)
     return np.asarray(cv2.remap(view, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
 @lru_cache(maxsize=2)
 def _places(width: int, height: int, span_deg: int) -> tuple[F32, F32]:
-    """Return, as two arrays, the view's column and row that each pixel of the crop shows.
-
-    Pixel centres have integer coordinates, as OpenCV requires.
-    """
+    """Return the view's column and row that each pixel of the crop shows, integers at pixel centres as in OpenCV."""
     columns = max(round(width * AHEAD_DEG / span_deg), 16)
     rows, half = max(round(columns / SHAPE), 9), np.tan(np.radians(AHEAD_DEG / 2))
     x = ((np.arange(columns) + 0.5) * 2 / columns - 1) * half

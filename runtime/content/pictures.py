@@ -17,11 +17,7 @@ from runtime.records import U8
 
 
 def screen(stack: PanelStack, *, width_px: int, height_px: int, pixel_aspect: float = 1.0) -> PlaneRaster:
-    """Return a picture's pixel grid on the plane x = 0, enlarged or reduced to fit the display.
-
-    Args:
-        pixel_aspect: Pixel width divided by pixel height.
-    """
+    """Return a picture's grid on the plane x = 0, fitted to the display. `pixel_aspect`: pixel width / height."""
     pitch_m = min(stack.width_m / (width_px * pixel_aspect), stack.height_m / height_px)
     return PlaneRaster(
         x_m=0.0,
@@ -35,9 +31,8 @@ def screen(stack: PanelStack, *, width_px: int, height_px: int, pixel_aspect: fl
 
 
 def prepare(file: SceneFile) -> Callable[..., ContentSource]:
-    """Open a picture, a video or a folder of pictures, and return a function that creates the source.
-
-    Raises InputError if the file cannot be shown, or if its first picture is too small for its layout.
+    """Open a picture, a video or a folder of pictures, and return a function that creates the source. Raises InputError
+    if the file cannot be shown, or if its first picture is too small for its layout.
     """
     frames = open_frames(file.path, file.settings)
     make = partial(PicturesSource, frames, file=file)
@@ -79,10 +74,7 @@ class PicturesSource(ContentSource):
         return self._shown[which].warped(matrix, view)
 
     def _take(self, number: int, picture: U8) -> None:
-        """Split a picture into views, and show these from now on.
-
-        Raises ValueError if the picture is too small for its layout.
-        """
+        """Split a picture into views, and show these now. Raises ValueError if it is too small for its layout."""
         layout = self._frames.layout(number)
         views = layout.views(picture)
         height, width = views[0].shape[:2]
@@ -92,10 +84,7 @@ class PicturesSource(ContentSource):
         self._views, self._at = views, number  # `_at` is the picture's number
 
     def _view_for(self, view: View) -> int:
-        """Return the index of the view that an eye sees.
-
-        For a stereo picture, the eye's side determines the view. For a quilt, the eye's angle does.
-        """
+        """Return the index of the view that an eye sees: by its side in a stereo picture, by its angle in a quilt."""
         if len(self._views) <= 2:
             return min(view.side, len(self._views) - 1)
         angle = np.arctan2(view.eye_m[1], view.eye_m[0])

@@ -50,10 +50,7 @@ class PipeOptions(Section):
 
 
 def prepare(file: SceneFile) -> Callable[..., ContentSource]:
-    """Check the options, and return a function that creates the source.
-
-    Raises InputError if an option is invalid, or if the path is not a pipe.
-    """
+    """Return a function that creates the source. Raises InputError if an option is invalid or there is no pipe."""
     options = validated(PipeOptions, file.settings.options, source="content.options")
     if options.path:
         path = Path(options.path)

@@ -23,10 +23,7 @@ NS_PER_MIN = 60 * NS_PER_S
 
 @dataclass(frozen=True, slots=True)
 class Placing:
-    """A scene's placement: p_stack = offset + scale · R · p_scene.
-
-    The rotation R is `rotation_deg`, followed by the turntable's current rotation.
-    """
+    """A scene's placement p_stack = offset + scale · R · p_scene; R is `rotation_deg`, then the turntable."""
 
     scale: float = 1.0
     offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # frame `stack`

@@ -40,17 +40,12 @@ class SceneFile:
         return self.settings.background or DARK
 
     def placed(self, low: F64, high: F64, *, custom: tuple[str, str] | None = None, facing: F64 | None = None) -> F64:
-        """Return the 4x4 stack_from_scene matrix for the file's content.
+        """Return the 4x4 stack_from_scene matrix for content between the corners `low` and `high` (3,).
 
-        If there is a preset, it determines the matrix. Otherwise, depending on the settings, the content is either
-        fitted to the display or left unscaled, with its coordinates taken as metres.
-
-        Args:
-            low: The content's lowest corner (3,).
-            high: The content's highest corner (3,).
-            custom: Axes (up, towards the viewer) that are usual for the file's format. By default, they depend on the
-                file's suffix.
-            facing: Area-weighted mean normal (3,) of the surface. If given, a flat mesh is turned to face the viewer.
+        A preset determines the matrix. Otherwise, depending on the settings, the content is either fitted to the
+        display or left unscaled, with its coordinates taken as metres. `custom` are the axes (up, towards the viewer)
+        that are usual for the file's format, by default its suffix's. With `facing`, the surface's area-weighted mean
+        normal (3,), a flat mesh is turned to face the viewer.
         """
         if self.preset:
             return stack_from_preset(self.preset)
@@ -81,14 +76,9 @@ class SceneFile:
 
 
 def guessed_axes(low: F64, high: F64) -> tuple[str, str]:
-    """Guess the content's axes (up, towards the viewer): either (+y, +z) or (+z, -y).
-
-    Objects often stand on the ground at height 0. If only one of the y and z ranges begins near 0 or above, that axis
-    is taken to be up. Otherwise, the longer axis is.
-
-    Args:
-        low: The content's lowest corner (3,).
-        high: The content's highest corner (3,).
+    """Guess the content's axes (up, towards the viewer) from its corners (3,): either (+y, +z) or (+z, -y). Objects
+    often stand on the ground at height 0. If only one of the y and z ranges begins near 0 or above, that axis is taken
+    to be up. Otherwise, the longer axis is.
     """
     size = np.maximum(high - low, 1e-30)
     y, z = np.maximum(low / size + 0.5, 0.0)[1:]  # 0 if centred on the origin, 0.5 if it begins there
@@ -97,19 +87,9 @@ def guessed_axes(low: F64, high: F64) -> tuple[str, str]:
 
 
 def turned_to_viewer(up: str, out: str, *, size: F64, facing: F64) -> tuple[str, str]:
-    """Choose the axes of a flat mesh so that its front faces the viewer.
-
+    """Return axes (up, towards the viewer) that let a flat mesh's front, of mean normal `facing` (3,), face the viewer.
     A mesh that is flat along the up axis is shown from above, with its near edge at the bottom. If a mesh is not flat,
     its axes are returned unchanged.
-
-    Args:
-        up: Axis that points up.
-        out: Axis that points towards the viewer.
-        size: Bounding box size (3,).
-        facing: Area-weighted mean normal (3,) of the surface.
-
-    Returns:
-        The axes (up, towards the viewer).
     """
     thinnest = int(size.argmin())
     axis = "xyz"[thinnest]
@@ -128,16 +108,9 @@ def _opposite(axis: str) -> str:
 
 
 def fitted(low: F64, high: F64, *, axes: F64, stack: PanelStack, depth_m: tuple[float, float]) -> F64:
-    """Return the 4x4 stack_from_scene matrix that fits a box to the display's size and depth.
-
-    The box is scaled and centred. If the scene is deeper than the range `depth_m`, it begins at the front of the range
-    and extends beyond the rear, where it is mostly hidden.
-
-    Args:
-        low: Lowest corner (3,) of the box, in the scene's frame.
-        high: Highest corner (3,) of the box, in the scene's frame.
-        axes: The scene_from_stack rotation (3, 3).
-        depth_m: Range of x (rear, front) to place content in.
+    """Return the 4x4 stack_from_scene matrix that scales and centres a box, corners (3,) in its frame, to fit the
+    display. `axes` is the scene_from_stack rotation. A scene deeper than the range `depth_m` (x: rear, front) begins at
+    its front and extends beyond the rear, where it is mostly hidden.
     """
     size = np.abs(axes.T @ (high - low))
     room = np.array([DEEPER * (depth_m[1] - depth_m[0]), stack.width_m * FILL, stack.height_m * FILL])

@@ -62,13 +62,8 @@ class Playlist:
 
 
 def read_playlist(path: Path, settings: ContentSettings) -> Playlist:
-    """Read a playlist file.
-
-    Args:
-        settings: Default settings for all entries, except for the placement, which applies to the playlist as a whole.
-
-    Raises:
-        InputError: The file is not a valid playlist. The message names the file, the entry and the field.
+    """Read a playlist file. `settings` are the entries' defaults, except for the placement, which applies to the whole.
+    Raises InputError, which names the file, the entry and the field, if it is not valid.
     """
     table = read_table(path)
     if "frames" in table and "show" not in table:
@@ -97,15 +92,7 @@ class PlaylistSource(ForwardingSource):
     """Source that plays a list of scenes one after another. The first request starts the playlist."""
 
     def __init__(self, playlist: Playlist, openers: list[Callable[..., ContentSource]], *, context: Any) -> None:
-        """Create the sources of all entries.
-
-        Args:
-            playlist: Playlist to show.
-            openers: For each entry, a function that creates its source, given `context`.
-
-        Raises:
-            InputError: An entry cannot be shown.
-        """
+        """Create the sources of all entries. Raises InputError if an entry cannot be shown."""
         self._list = playlist
         self._ends_ns = list(accumulate(round(entry.seconds * NS_PER_S) for entry in playlist.entries))
         self._begin_ns: int | None = None
@@ -133,10 +120,8 @@ class PlaylistSource(ForwardingSource):
         return self._sources[self._number % len(self._sources)]
 
     def describe(self, *, time_ns: int) -> dict[str, Any]:
-        """Return the playlist's status.
-
-        The keys are `entries` (scenes and durations), `index` (current entry) and `left_s` (time left for the current
-        scene, or None if it stays).
+        """Return the status: `entries` (scenes and durations), `index` (current) and `left_s` (None if the scene
+        stays).
         """
         entries = [{"scene": entry.scene, "seconds": entry.seconds} for entry in self._list.entries]
         index, since_ns = self._at(time_ns)
@@ -172,10 +157,7 @@ class PlaylistSource(ForwardingSource):
         return since_ns
 
     def _at(self, time_ns: int) -> tuple[int, int]:
-        """Return the number of the entry due at a given time, and how long it has been due, in ns.
-
-        Entries are counted across repetitions of the playlist.
-        """
+        """Return the number of the entry due, counted across repetitions, and how long it has been due, in ns."""
         passed_ns = max(0, time_ns - (time_ns if self._begin_ns is None else self._begin_ns))
         count, round_ns = len(self._ends_ns), self._ends_ns[-1]
         if not self._list.repeat:

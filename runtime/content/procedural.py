@@ -20,10 +20,7 @@ MODELLED_HEIGHT_M = 0.2916  # display height that the scenes' lengths are meant 
 
 
 def parts_of(built_in: Scene) -> list[DrawnPart]:
-    """Prepare a scene's parts, one per object.
-
-    This is the slower half of opening a scene. It needs no GL context and may run on any thread.
-    """
+    """Prepare a scene's parts, one per object: the slow half of opening it, on any thread, without a GL context."""
     pictures = {name: textures.texture(name) for name in {thing.texture for thing in built_in.things}}
     return [
         DrawnPart(
@@ -52,14 +49,7 @@ class ProceduralSource(TriangleSource):
         background: Colour | None = None,
         parts: Sequence[DrawnPart] | None = None,
     ) -> None:
-        """Create the source.
-
-        Args:
-            built_in: Scene or scene name.
-            stack: The display's panels. The scene is scaled to their height.
-            background: Background colour, by default the scene's.
-            parts: Parts that `parts_of` returned for the scene, if they were prepared on another thread.
-        """
+        """Create a scene, scaled to the panels' height, from its `parts_of` if they were prepared on another thread."""
         self._scene = SCENES[built_in]() if isinstance(built_in, str) else built_in
         self._scale = stack.height_m / MODELLED_HEIGHT_M
         parts = parts or parts_of(self._scene)

@@ -110,9 +110,8 @@ class _Form:
         return (4 + depth_bytes) * self.width_px * self.height_px
 
     def picture(self, data: memoryview) -> ProgramPicture:
-        """Return the picture in a message or in shared memory, without copying it.
-
-        Raises ValueError if the data has the wrong size.
+        """Return the picture in a message or in shared memory, uncopied. Raises ValueError if the data has the wrong
+        size.
         """
         if len(data) != self.bytes:
             parts = "RGBA pixels" if self.depth is None else f"RGBA pixels and {self.depth.name} depths"
@@ -128,11 +127,9 @@ class _Form:
 
 
 class _Memory:
-    """Memory that a program on the same machine can write its pictures to.
-
-    A file in memory has no name, so it ends with the last process that uses it. The program opens it through this
-    process's entry in /proc, which only the same user can do. It cannot be made smaller, because reading beyond its end
-    would end the process.
+    """Memory that a program on the same machine can write its pictures to. A file in memory has no name, so it ends
+    with the last process that uses it. The program opens it through this process's entry in /proc, which only the same
+    user can do. It cannot be made smaller, because reading beyond its end would end the process.
     """
 
     def __init__(self, size_bytes: int) -> None:
@@ -258,19 +255,13 @@ class _Client:
 
 
 class ProgramServer:
-    """Server that drawing programs connect to in order to receive requests and send pictures.
-
-    The program that connected last does the drawing. Programs that only listen receive the same requests. The methods
-    may be called on any thread. None waits for a program, except for `drawn`.
+    """Server that drawing programs connect to in order to receive requests and send pictures. The program that
+    connected last does the drawing. Programs that only listen receive the same requests. The methods may be called on
+    any thread. None waits for a program, except for `drawn`.
     """
 
     def __init__(self, port: int, token: str) -> None:
-        """Listen on a port of the loopback interface. Raises OSError if the port cannot be opened.
-
-        Args:
-            port: TCP port, or 0 for any free port.
-            token: Secret that an address must contain.
-        """
+        """Listen on a loopback TCP port, 0 for any; an address must contain the token. Raises OSError if that fails."""
         self._token = token
         self._changed = threading.Condition()  # guards the fields below, up to `_socket`
         self._drawing: _Client | None = None  # latest drawing program
@@ -293,9 +284,8 @@ class ProgramServer:
         )
 
     def ask(self, asked: AskedViews) -> int:
-        """Request a frame's pictures, and return the frame's number.
-
-        Raises ContentFailure if no program is connected or too many requests are unanswered.
+        """Request a frame's pictures, and return its number. Raises ContentFailure without a program or with too many
+        unanswered.
         """
         now_s = time.monotonic()
         with self._changed:
@@ -317,10 +307,7 @@ class ProgramServer:
         return number
 
     def drawn(self, number: int) -> DrawnPictures:
-        """Wait until a frame is complete, and return its pictures.
-
-        Raises ContentFailure if the pictures do not arrive within `ANSWERED_S` or the program disconnects.
-        """
+        """Wait for a frame. Raises ContentFailure if it takes over `ANSWERED_S` or the program disconnects."""
         with self._changed:
             frame = self._frames.get(number)
             if frame is not None:
@@ -493,16 +480,9 @@ _addresses: dict[int, tuple[int, str]] = {}  # port and token of the last server
 
 
 def acquire(port: int) -> ProgramServer:
-    """Return the server for a port. Each caller must later call `release`.
-
-    The address, with the token, stays the same for the life of the process if the port is still free, so that programs
-    find the server again after a scene or the solver has been restarted.
-
-    Args:
-        port: TCP port, or 0 for any free port.
-
-    Raises:
-        InputError: The port cannot be opened.
+    """Return the server for a TCP port, 0 for any, which the caller must `release`. Raises InputError if it cannot be
+    opened. The address, with the token, stays the same for the life of the process if the port is still free, so that
+    programs find the server again after a scene or the solver has been restarted.
     """
     with _lock:
         server, users = _servers.get(port, (None, 0))

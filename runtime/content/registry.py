@@ -52,13 +52,8 @@ Opener = Callable[..., ContentSource]  # creates a source, given the keyword arg
 
 
 def open_content(settings: ContentSettings, stack: PanelStack, context: Any) -> ContentSource:
-    """Open the scene specified by the settings: a built-in scene, a preset, a class, a file or a folder.
-
-    Args:
-        context: Current moderngl context on the thread that will use the source.
-
-    Raises:
-        InputError: The scene cannot be shown. The message names the file and the field.
+    """Open the scene that the settings specify: a built-in scene, a preset, a class, a file or a folder. `context` is
+    the moderngl context of the thread that will use it. Raises InputError, which names file and field.
     """
     return prepare_content(settings, stack)(context=context)
 
@@ -66,12 +61,9 @@ def open_content(settings: ContentSettings, stack: PanelStack, context: Any) -> 
 def prepare_content(settings: ContentSettings, stack: PanelStack) -> Opener:
     """Read and check the scene specified by the settings, and return a function that creates the source.
 
-    Preparation is slow, but needs no GL context and may run on any thread. Files are read in a child process, except
-    for small pictures. Progress is reported through `support.progress`. The returned function must be called on the GL
-    context's thread.
-
-    Raises:
-        InputError: The scene cannot be shown or takes too long to load. The message names the file and the field.
+    Preparation is slow, but may run on any thread and reports progress; only the function needs the GL context's
+    thread. Files are read in a child process, except for small pictures. Raises InputError, which names file and field,
+    if the scene cannot be shown or takes too long to load.
     """
     file = SceneFile(Path(settings.scene), settings, stack)
     too_slow = InputError(settings.scene, "", f"takes longer than {LIMITS.load_s:g} s to load")
@@ -164,10 +156,7 @@ def _is_harmless(file: SceneFile) -> bool:
 
 
 def _read(file: SceneFile) -> Opener:
-    """Read a file or folder with the reader for its suffix and contents.
-
-    The returned function can be pickled, so the file can be read in a child process.
-    """
+    """Read a file or folder with the reader for its suffix and contents, and return an opener that can be pickled."""
     path = file.path
     suffix = path.suffix.lower()
     if path.is_dir():
@@ -220,10 +209,8 @@ def _playlist(file: SceneFile) -> Opener:
 
 
 def _plugin(name: str, file: SceneFile) -> Opener:
-    """Import a user-defined scene's class, and return a function that creates the source.
-
-    The returned function draws a trial picture, and raises InputError if the picture or the source is faulty. Raises
-    InputError if the class cannot be imported or the options are invalid.
+    """Import a user-defined scene's class, and return a function that creates the source and draws a trial picture.
+    Raises InputError if the class cannot be imported or the options are invalid, and so does the function for a fault.
     """
     plugin = plugin_class(name, ContentSource, field="content.scene")
     options = validated(strict(plugin.Options), file.settings.options, source="content.options")

@@ -1,8 +1,8 @@
 """Draw a picture with depth (colour and a grey depth map, side by side) as two surfaces.
 
-The front surface shows the picture. It is split wherever the depth jumps, because otherwise the foreground would be
-stretched there. The second surface fills the hole that a viewer would see when looking past such an edge. It shows a
-background invented from the depths and colours next to the edge.
+The front surface shows the picture and is split wherever the depth jumps, where the foreground would be stretched. The
+second one fills the hole that a viewer would see when looking past such an edge with a background invented from the
+depths and colours next to the edge. Everywhere, colours are (h, w, 3), and depths (h, w) from 0 (rear) to 1 (front).
 """
 
 from __future__ import annotations
@@ -45,10 +45,8 @@ Mask = NDArray[np.bool_]
 
 
 def split_rgbd(rgb: U8, path: Path) -> tuple[U8, F32]:
-    """Split a picture into colour (left half, shape (h, w, 3)) and depth (right half, shape (h, w)).
-
-    Depth is 0 at the rear and 1 at the front. Raises InputError if the picture is too small, or if the right half is
-    not grey.
+    """Split a picture into colour (left half) and depth (right half). Raises InputError if it is too small, or if the
+    right half is not grey.
     """
     width = rgb.shape[1] // 2
     if width < 2 or rgb.shape[0] < 2:
@@ -60,15 +58,9 @@ def split_rgbd(rgb: U8, path: Path) -> tuple[U8, F32]:
 
 
 def surfaces(colour: U8, depth: F32, *, stack: PanelStack, depth_m: tuple[float, float]) -> list[Part]:
-    """Return the front surface and, if there are edges, the background behind them.
-
-    Each surface point is on the ray from the nominal eye position through the point's pixel.
-
-    Args:
-        colour: Picture (h, w, 3).
-        depth: Depth (h, w), from 0 (rear) to 1 (front).
-        stack: The display's panels. The picture is fitted to their size.
-        depth_m: The x coordinates of depth 0 and depth 1 in frame `stack`.
+    """Return the front surface and, if there are edges, the background. Depths 0 and 1 are at x = `depth_m` in `stack`.
+    Each point is on the ray from the nominal eye position through its pixel of the picture, which is fitted to the
+    panels.
     """
     depth = sharpened(depth)
     colour = unmixed(colour, depth)
@@ -92,10 +84,7 @@ def surfaces(colour: U8, depth: F32, *, stack: PanelStack, depth_m: tuple[float,
 
 
 def sharpened(depth: F32) -> F32:
-    """Sharpen the edges in a depth map (h, w).
-
-    Each pixel in a blurred edge is given the near or the far side's depth, whichever is closer to its previous depth.
-    """
+    """Sharpen a depth map: pixels in blurred edges get the near or the far side's depth, whichever is closer."""
     kernel = np.ones((BLURRED_PX, BLURRED_PX), np.uint8)
     high, low = cv2.dilate(depth, kernel), cv2.erode(depth, kernel)
     snapped = np.where(high - depth < depth - low, high, low)
@@ -103,13 +92,8 @@ def sharpened(depth: F32) -> F32:
 
 
 def unmixed(colour: U8, depth: F32) -> U8:
-    """Replace colours next to depth edges, because they may be a mixture of both sides.
-
-    Each new colour is taken from a pixel on the same side, farther from the edge.
-
-    Args:
-        colour: Picture (h, w, 3).
-        depth: Depth (h, w), from 0 to 1.
+    """Replace colours next to depth edges, which may mix both sides, by those of pixels farther from the edge on each
+    side.
     """
     side = 2 * MIXED_PX + 1
     kernel = np.ones((side, side), np.uint8)
@@ -129,17 +113,8 @@ def unmixed(colour: U8, depth: F32) -> U8:
 
 
 def background(depth: F32, colour: U8) -> tuple[F32, U8, Mask]:
-    """Invent the background behind depth edges.
-
-    The far side's depth and colour are continued behind the near side. The mask also includes a band of the far side
-    itself, to close gaps at the edge.
-
-    Args:
-        depth: Depth (h, w), from 0 to 1.
-        colour: Picture (h, w, 3).
-
-    Returns:
-        Depth (h, w) and colour (h, w, 3) of the background, and a mask (h, w) of the pixels that belong to it.
+    """Invent the background behind depth edges: its depth, its colour, and the mask (h, w) of its pixels. The far side
+    is continued behind the near side. The mask also includes a band of the far side, to close gaps.
     """
     far_side = depth < cv2.dilate(depth, np.ones((5, 5), np.uint8)) - TORN_RELATIVE
     if not far_side.any():
@@ -151,9 +126,8 @@ def background(depth: F32, colour: U8) -> tuple[F32, U8, Mask]:
 
 
 def _quads(depth: F32) -> I32:
-    """Divide a depth map into quads (n, 4), given as flat pixel indices of their corners.
-
-    Smooth areas get large quads, and edges get single-pixel quads. Quads that cross an edge are left out.
+    """Divide a depth map into quads (n, 4) of flat indices, large in smooth areas, single pixels at edges, none across
+    them.
     """
     rows, columns = depth.shape
     step = -(-columns // COLUMNS)
@@ -201,9 +175,8 @@ def _edge_to_edge(index: Any, count: int) -> F64:
 
 
 def prepare(file: SceneFile) -> Callable[..., TriangleSource]:
-    """Read a picture with depth, and return a function that creates the source in a GL context.
-
-    Raises InputError if the picture cannot be read or its right half is not a depth map.
+    """Read a picture with depth, and return a function that creates the source in a GL context. Raises InputError if
+    the picture cannot be read or its right half is not a depth map.
     """
     colour, depth = split_rgbd(open_frames(file.path, file.settings).frame(0), file.path)
     # A split surface also has edges inside its outline, so it needs multisampling instead of ramps.

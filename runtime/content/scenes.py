@@ -84,10 +84,7 @@ def _demo(turns_per_s: float = 0.0) -> tuple[Thing, ...]:
 
 
 def _room() -> tuple[Thing, ...]:
-    """Return a dim room with objects in it. The nearest one is a globe.
-
-    The room is behind the display and wider than it.
-    """
+    """Return a dim room, behind the display and wider than it, with objects of which a globe is the nearest."""
     wide, high, back = 0.56, 0.34, -0.14
     deep = 0.02 - back
     middle, down = (0.02 + back) / 2, shapes.rotation_about(1, -np.pi / 2)

@@ -67,11 +67,9 @@ def welded(positions_m: F32) -> NDArray[np.int64]:
 
 
 def solid_winding(shape: Shape) -> int:
-    """Return the winding of a solid shape's triangles, or 0 if the shape is not solid.
-
-    The triangles of a solid shape enclose volumes and have the same winding everywhere, as seen from outside: 1 if it
-    is counter-clockwise, -1 if it is clockwise. From outside, the back faces of such a shape are always hidden.
-    Vertices at the same position are treated as one, and connected triangles as one body.
+    """Return the winding of a solid shape's triangles, 1 (counter-clockwise from outside) or -1, or 0 if it is not
+    solid. The triangles of a solid shape enclose volumes and have the same winding everywhere, so its back faces are
+    always hidden. Vertices at the same position are treated as one, and connected triangles as one body.
     """
     corners = welded(shape.positions_m)[shape.triangles]
     real = (np.diff(np.sort(corners, axis=1), axis=1) > 0).all(1)  # a sphere has zero-area triangles at its poles
@@ -97,11 +95,7 @@ def solid_winding(shape: Shape) -> int:
 
 
 def flat_normals(corners: ArrayLike) -> F32:
-    """Return the triangles' unit normals (t, 3). The normal is zero if a triangle has no area.
-
-    Args:
-        corners: Positions (t, 3, 3) of each triangle's three corners.
-    """
+    """Return the unit normals (t, 3) of triangles' corners (t, 3, 3), zero for a triangle without area."""
     corners = np.asarray(corners)
     normals = np.empty((len(corners), 3), np.float32)
     for first in range(0, len(corners), AT_ONCE):
@@ -112,10 +106,7 @@ def flat_normals(corners: ArrayLike) -> F32:
 
 
 class Origin:
-    """Point that is subtracted from a file's coordinates before they become float32.
-
-    It is zero unless the file's first positions are so far from zero that float32 would lose their detail.
-    """
+    """Point subtracted from a file's coordinates before they become float32: zero unless they would lose detail."""
 
     def __init__(self) -> None:
         self.point: F64 | None = None  # (3,) in the file's coordinates; None before the first positions
@@ -131,16 +122,8 @@ class Origin:
 
 
 def placed(positions: ArrayLike, normals: ArrayLike | None, matrices: F64, *, origin: Origin) -> tuple[F32, F32 | None]:
-    """Transform positions and normals by an affine matrix.
-
-    Args:
-        positions: Vertex positions (v, 3).
-        normals: Vertex normals (v, 3), or None.
-        matrices: One matrix (4, 4) for all vertices, or one matrix per vertex (v, 4, 4).
-        origin: Origin of the returned positions.
-
-    Returns:
-        Positions (v, 3) and unit normals (v, 3). The normals are None if none are given.
+    """Transform positions and normals (v, 3) or None by one affine matrix (4, 4), or one per vertex (v, 4, 4), and
+    subtract `origin`. Normals remain unit vectors.
     """
     positions = np.asarray(positions)
     moved = np.empty(positions.shape, np.float32)
@@ -173,11 +156,7 @@ def rotation_about(axis: int, angle_rad: float) -> F64:
 
 
 def _grid(u: F64, v: F64) -> tuple[F64, F64, I32]:
-    """Return a triangulated grid of vertices, with the given parameters along columns and rows.
-
-    Returns:
-        The parameters u and v of each vertex, and the triangles (t, 3) of the grid.
-    """
+    """Return the u and v of each vertex of a grid with these columns and rows, and its triangles (t, 3)."""
     columns, rows = len(u), len(v)
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).reshape(-1)
     first = np.column_stack([corner, corner + 1, corner + columns])
@@ -191,12 +170,8 @@ def _shape(positions: F64, normals: F64, uv: F64, triangles: I32) -> Shape:
 
 
 def card(width_m: float, height_m: float, *, repeat: tuple[float, float] = (1.0, 1.0)) -> Shape:
-    """Return a rectangle in the plane x = 0. Seen from +x, its texture is upright and not mirrored.
-
-    Args:
-        width_m: Width along y.
-        height_m: Height along z.
-        repeat: Number of times the texture is repeated along the width and the height.
+    """Return a rectangle, width along y and height along z, in x = 0. From +x, its repeated texture is upright and
+    unmirrored.
     """
     s, t, triangles = _grid(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
     positions = np.column_stack([0 * s, (s - 0.5) * width_m, (0.5 - t) * height_m])
@@ -228,13 +203,8 @@ def sphere(radius_m: float, *, columns: int = 48, rows: int = 24) -> Shape:
 
 
 def torus(radius_m: float, tube_m: float, *, columns: int = 64, rows: int = 24) -> Shape:
-    """Return a torus around the x axis.
-
-    Args:
-        radius_m: Distance from the torus's centre to the centre of the tube.
-        tube_m: Tube radius.
-        columns: Number of segments around the axis.
-        rows: Number of segments around the tube.
+    """Return a torus around the x axis; `radius_m` is from its centre to the tube's, `columns` are segments around the
+    axis.
     """
     s, t, triangles = _grid(np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1))
     around, across = s * 2 * np.pi, t * 2 * np.pi
@@ -249,12 +219,8 @@ def _runs(marks: str) -> list[tuple[int, int]]:
 
 
 def lettering(text: str, *, cell_m: float, depth_m: float) -> Shape:
-    """Return text in solid letters, centred on the origin and readable from +x.
-
-    Args:
-        text: Text whose letters are all in `GLYPHS`.
-        cell_m: Cell size. Each letter is 5 x 7 cells in size, with a gap of one cell between letters.
-        depth_m: Depth along x.
+    """Return text of `GLYPHS` in solid letters of 5 x 7 cells, one cell apart, centred on the origin and readable from
+    +x.
     """
     left = -(len(text) * 6 - 1) / 2
     bars = []
@@ -270,14 +236,7 @@ def lettering(text: str, *, cell_m: float, depth_m: float) -> Shape:
 
 
 def fence(width_m: float, height_m: float, *, bars: int, bar_m: float) -> Shape:
-    """Return a fence with upright bars and two rails in the plane x = 0.
-
-    Args:
-        width_m: Width along y.
-        height_m: Height along z.
-        bars: Number of bars.
-        bar_m: Thickness of the bars and rails.
-    """
+    """Return a fence with upright bars and two rails, all `bar_m` thick, in the plane x = 0."""
     upright = [
         box((bar_m, bar_m, height_m)).moved(offset_m=(0.0, y, 0.0))
         for y in np.linspace(-width_m / 2, width_m / 2, bars)

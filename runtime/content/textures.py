@@ -16,13 +16,7 @@ def _coordinates() -> tuple[F64, F64]:
 
 
 def _mixed(weight: F64, first: tuple[int, int, int], second: tuple[int, int, int]) -> U8:
-    """Return a picture that mixes two colours.
-
-    Args:
-        weight: Weight (h, w) of the first colour, 0-1.
-        first: First colour, 0-255.
-        second: Second colour, 0-255.
-    """
+    """Return a picture of two colours, 0-255, with the weight (h, w) of the first one."""
     rgb = weight[..., None] * np.array(first) + (1 - weight[..., None]) * np.array(second)
     alpha = np.full((*weight.shape, 1), 255.0)
     return np.concatenate([np.clip(np.rint(rgb), 0, 255), alpha], axis=2).astype(np.uint8)

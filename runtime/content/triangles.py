@@ -127,19 +127,10 @@ void main() {
 
 
 class DrawnPart:
-    """Part prepared for drawing. After `upload`, it also owns GL objects.
-
-    A part can be prepared on any thread, without a GL context. The part's source uploads it later.
-    """
+    """Part prepared for drawing, on any thread and without a GL context. After `upload`, it also owns GL objects."""
 
     def __init__(self, part: Part, *, outlined: bool = True) -> None:
-        """Prepare a part for drawing.
-
-        Args:
-            part: Part to draw.
-            outlined: Find the part's edges, so that its outlines can be smoothed. Translucent and large parts are never
-                outlined.
-        """
+        """Prepare a part, with edges for smooth outlines if `outlined` and neither translucent nor large."""
         mesh = part.shape
         self.features, self.sampler = part.features, part.sampler
         self.pictures, self.glow, self.two_sided = (part.picture, part.glow_picture), part.glow, part.two_sided
@@ -179,13 +170,7 @@ class DrawnPart:
         return look.front_face if self._solid_winding > 0 else {"cw": "ccw", "ccw": "cw"}[look.front_face]
 
     def upload(self, context: Any, surface_program: Any, outline: Any, textures: list[Any]) -> None:
-        """Create the part's GL objects.
-
-        Args:
-            surface_program: Shader program for the triangles, owned by the source.
-            outline: Vertex array for outlines, owned by the source.
-            textures: The part's textures, owned by the source.
-        """
+        """Create the part's GL objects; the source owns the program, the outlines' vertex array, and the textures."""
         self.surface_program, self.outline, self.textures = surface_program, outline, textures
         self._buffer, self._triangles = (_uploaded(context, array) for array in (self.vertices, self.triangles))
         if self.edges is None and not self.is_projected:  # this may free hundreds of MiB
@@ -194,10 +179,7 @@ class DrawnPart:
         self.surface = context.vertex_array(surface_program, [layout], index_buffer=self._triangles)
 
     def draw_surface(self) -> None:
-        """Draw the part's triangles.
-
-        Large parts are drawn in several calls, because a software rasteriser holds Python's lock during each call.
-        """
+        """Draw the part's triangles, in several calls if large: a software rasteriser holds Python's lock in each."""
         for first in range(0, self.corner_count, 3 * DRAWN_AT_ONCE):
             self.surface.render(first=first, vertices=min(3 * DRAWN_AT_ONCE, self.corner_count - first))
 
@@ -263,14 +245,8 @@ class TriangleSource(CanvasSource):
         info: ContentInfo,
         samples: int = 0,
     ) -> None:
-        """Create the source.
-
-        Args:
-            parts: Parts to draw.
-            stack_from_parts: Each part's placement, a 4x4 similarity.
-            info: Scene properties.
-            samples: Samples per pixel. If 0, outlines are smoothed with ramps instead of multisampling, which is faster
-                on a software rasteriser.
+        """Create the source of parts, each placed by a 4x4 similarity. With 0 samples per pixel, outlines are smoothed
+        with ramps, which is faster on a software rasteriser.
         """
         super().__init__(context, info=info, samples=samples)
         self.parts, self.stack_from_parts = list(parts), list(stack_from_parts)
@@ -292,10 +268,7 @@ class TriangleSource(CanvasSource):
         self.held += [*self._textures.values(), *self._programs.values()]
 
     def places(self, time_ns: int) -> Sequence[F64]:
-        """Return each part's 4x4 placement at a given time.
-
-        Subclasses for moving scenes override this method. The default returns constant placements.
-        """
+        """Return each part's 4x4 placement at a given time; subclasses for moving scenes override this."""
         return self.stack_from_parts
 
     def extent(self, view: View, *, time_ns: int) -> PixelRect:
@@ -351,10 +324,7 @@ class TriangleSource(CanvasSource):
         return self.drawn(view, area, paint)
 
     def _draw_translucent(self, placed: list[tuple[DrawnPart, _Look]]) -> None:
-        """Blend translucent parts over opaque parts, farthest first.
-
-        Each part's back faces are drawn before its front faces.
-        """
+        """Blend translucent parts over opaque parts, farthest first, and each part's back faces before its front."""
         context, framebuffer = self.context, self.context.fbo
         context.enable_only(context.DEPTH_TEST | context.BLEND | context.CULL_FACE)
         context.blend_func = OVER
@@ -442,14 +412,7 @@ def _gl(matrix: F64) -> F32:
 
 
 def _layout(program: Any, buffer: Any, names: tuple[str, ...], sizes: tuple[int, ...]) -> tuple[Any, ...]:
-    """Describe a buffer for a moderngl vertex array.
-
-    Args:
-        program: Program that reads the buffer. Attributes that the compiler has removed are skipped.
-        buffer: Buffer with the attributes of consecutive vertices.
-        names: Names of the attributes.
-        sizes: Number of floats in each attribute.
-    """
+    """Describe a buffer of named attributes of `sizes` floats for moderngl, without those that the compiler removed."""
     used = [name for name in names if name in program]
     formats = [f"{size}f" if name in used else f"{size * 4}x" for name, size in zip(names, sizes, strict=True)]
     return (buffer, " ".join(formats), *used)

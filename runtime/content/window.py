@@ -68,10 +68,7 @@ class Place:
 
 
 def prepare(file: SceneFile) -> Callable[..., ContentSource]:
-    """Check the options, and return a function that creates the source.
-
-    Raises InputError if an option is invalid, or if there is no X server or a Debian package is missing.
-    """
+    """Return a function that creates the source. Raises InputError for wrong options or no X server."""
     options = validated(WindowOptions, file.settings.options, source="content.options")
     needed = {"xwininfo": "x11-utils"} if options.title else {"Xvfb": "xvfb"} if options.command else {}
     for program, package in needed.items():
@@ -87,13 +84,8 @@ def _source(options: WindowOptions, file: SceneFile, context: Any = None) -> Con
 
 
 def place_of(title: str, listed: str) -> Place | None:
-    """Return the place of the largest window whose title or class contains a text, or None.
-
-    Our own panels are not found.
-
-    Args:
-        title: Text to look for, in any case.
-        listed: What `xwininfo -root -tree` prints.
+    """Return the place of the largest window, but our panels, whose title or class contains a text, in any case, or
+    None. `listed` is what `xwininfo -root -tree` prints.
     """
     found = []
     for line in listed.splitlines():

@@ -45,23 +45,17 @@ class Alignment:
 
 
 def reference_plane(stack: PanelStack) -> Plane:
-    """Return an alignment's reference plane.
-
-    It is the centre panel's plane or, if the number of panels is even, the plane halfway between the two middle panels.
-    """
+    """Return the plane on which aligned content stays: the centre panel's, or halfway between the two middle panels."""
     half = stack.count // 2
     return Plane(stack.x_m[half] if stack.count % 2 else (stack.x_m[half - 1] + stack.x_m[half]) / 2)
 
 
 def align(stack: PanelStack, *, solved_for_m: Eyes, eyes_m: Eyes) -> Alignment:
-    """Align layers that were solved for other eye positions to the current eyes.
+    """Align layers that were solved for other eye positions to the current eyes. Never raises an exception.
 
-    An alignment has three limits: each eye must be at least `NEAREST_M` in front of the front panel, a panel's centre
-    may move by at most `MOST_SHIFT` of the panel's size, and a panel may be enlarged or reduced by at most a factor of
-    `MOST_SCALE`. If the current eyes exceed a limit, the layers are aligned to the farthest allowed point on the
-    straight line from the old eyes to the current eyes, which keeps the alignment continuous.
-
-    Never raises an exception. If a coordinate is not finite, the layers are left unchanged.
+    At the limits `NEAREST_M`, `MOST_SHIFT` and `MOST_SCALE`, the layers are aligned to the farthest allowed point on
+    the straight line from the old eyes to the current eyes, so that the alignment stays continuous. If a coordinate is
+    not finite, the layers are left unchanged.
     """
     if not (np.abs(solved_for_m).max() <= FARTHEST_M and np.abs(eyes_m).max() <= FARTHEST_M):  # also catches NaN
         return Alignment(_as_they_are(stack), "the eye positions are not finite")
@@ -95,10 +89,8 @@ def _as_they_are(stack: PanelStack) -> tuple[F64, ...]:
 def _limits(
     stack: PanelStack, solved_x_m: list[float], eyes_x_m: list[float], *, old: list[float], step: list[float]
 ) -> Iterator[tuple[float, float, str]]:
-    """Yield (most, least, limit) for each of an alignment's limits.
-
-    A fraction `share` of the movement is allowed if share · most <= least. `limit` is `left` or `right` for an eye's
-    distance, and the panel's number for its shift and scale.
+    """Yield (most, least, limit) for each limit: the share of the movement that satisfies share · most <= least is
+    allowed. `limit` is `left` or `right` for an eye's distance, and a panel's number for its shift and scale.
     """
     front_m = stack.x_m[-1]
     for name, before_m, after_m in zip(("left", "right"), solved_x_m, eyes_x_m, strict=True):

@@ -24,17 +24,9 @@ Picture = U8 | F32  # (h, w, 3)
 
 
 def as_cameras(matrices: Any, *, count: int = 2) -> tuple[F64, F64]:
-    """Return the projections and positions of cameras, given their 3x4 matrices.
-
-    Args:
-        matrices: The cameras' matrices, which map metres in frame `stack` to pixels.
-
-    Returns:
-        The (V, 3, 4) matrices, with signs chosen so that the third homogeneous coordinate is positive in front of the
-        camera, and the (V, 3) positions in metres in frame `stack`.
-
-    Raises:
-        ValueError: `matrices` are not finite 3x4 matrices, or the left 3x3 part of one of them has no inverse.
+    """Return the (V, 3, 4) projections and (V, 3) positions of cameras, given their 3x4 matrices from metres in `stack`
+    to pixels. Signs are chosen so that the third homogeneous coordinate is positive in front of the camera. Raises
+    ValueError if a matrix is not finite or its left 3x3 part has no inverse.
     """
     try:
         cameras = np.asarray(matrices, np.float64)
@@ -54,16 +46,9 @@ def as_cameras(matrices: Any, *, count: int = 2) -> tuple[F64, F64]:
 def looking_at_origin(
     pictures: Sequence[Picture], cameras: F64, eyes_m: Eyes, stack: PanelStack
 ) -> tuple[list[Picture], float]:
-    """Resample cameras' pictures as if the cameras had been aimed at the stack's origin.
-
-    The new pictures cover as much of the panels as all originals allow, and are sampled bicubically. If all cameras
-    are already aimed at the origin, their pictures are returned unchanged.
-
-    Returns:
-        The resampled (h, w, 3) pictures, and their horizontal field of view in degrees.
-
-    Raises:
-        ValueError: A picture does not show the stack's centre.
+    """Resample pictures as if their cameras had been aimed at the stack's origin; return them and their fov_deg. The
+    new pictures cover as much of the panels as all originals allow, and are sampled bicubically. Aimed pictures are
+    returned unchanged. Raises ValueError if a picture does not show the stack's centre.
     """
     height, width = pictures[0].shape[:2]
     turns = [np.diag([1.0, -1.0, -1.0]) @ stack_from_eye(eye_m)[:3, :3].T for eye_m in eyes_m]
@@ -108,9 +93,8 @@ def looking_at_origin(
 
 
 def _within(matrix: F64, half: F64, width: int, height: int) -> bool:
-    """Return True if a picture covers every direction (x, y, 1) with |x| <= half[0] and |y| <= half[1].
-
-    `matrix` (3x3) maps homogeneous directions to picture pixels.
+    """Return True if a picture covers all directions (x, y, 1) with |x| <= half[0] and |y| <= half[1]. `matrix` maps
+    them to its pixels.
     """
     corners = np.array([(x * half[0], y * half[1], 1.0) for x in (-1, 1) for y in (-1, 1)]) @ matrix.T
     if not (corners[:, 2] > 0).all():

@@ -38,16 +38,12 @@ class _Compared:
     panel: PlaneRaster
 
     def ghosts(self, unit_m: float) -> float:
-        """Estimate how much light reaches the wrong eye because panel values are limited.
+        """Estimate the RMS light that reaches the wrong eye because panel values are limited, relative to full scale.
 
-        The two eyes' rays through a point on the front panel cross the middle panel `unit_m` apart. Their rays through
-        a point on the rear panel cross it the same distance apart, but in reverse order. In panel values, the
-        difference between the eyes' pictures is therefore `unit_m` times the slope of (front - rear), and front - rear
-        is limited to [-1, 1]. Each row is integrated from left to right. Where the integral would leave this range, the
-        difference is lost, and both eyes see the mean.
-
-        Returns:
-            The ghosts' root mean square, relative to full scale.
+        The two eyes' rays through a point on the front panel cross the middle panel `unit_m` apart; through a point on
+        the rear panel, the same distance apart in reverse order. The difference between the eyes' pictures is therefore
+        `unit_m` times the slope of (front - rear), which is limited to [-1, 1]. Where the integral along a row would
+        leave this range, the difference is lost, and both eyes see the mean.
         """
         light = np.stack(self.grey) / 255.0
         value = np.arcsin(np.sqrt(light)) / (np.pi / 2)
@@ -63,10 +59,8 @@ class _Compared:
         return float(np.sqrt(np.mean((share * (light[0] - light[1]) / 2)[both] ** 2))) if both.any() else 0.0
 
     def disparities_m(self) -> F64:
-        """Return the (n,) disparities of all unambiguously matched points, in metres on the middle panel.
-
-        Disparity is positive for a point in front of the middle panel, which appears farther right to the left eye than
-        to the right eye. The result is empty if most of the picture is repetitive or too few points match.
+        """Return the (n,) disparities of unambiguously matched points, in metres on the middle panel, positive in front
+        of it. The result is empty if most of the picture is repetitive or too few points match.
         """
         sides = 0, 0, REACH_PX, REACH_PX
         framed: list[Any] = [
@@ -86,11 +80,7 @@ class _Compared:
 
 
 def _compared(pictures: Sequence[U8 | F32], eyes_m: Eyes, stack: PanelStack, *, fov_deg: float) -> _Compared:
-    """Resample two pictures to a coarse middle-panel raster.
-
-    Args:
-        pictures: Left and right (h, w, 3) picture, each from a camera at the eye that is aimed at the stack's origin.
-    """
+    """Resample left and right picture, from cameras aimed at the stack's origin, to a coarse middle-panel raster."""
     small = replace(stack, width_px=WIDTH_PX, height_px=max(16, round(WIDTH_PX * stack.height_m / stack.width_m)))
     panel, size = small.panel(stack.count // 2), (WIDTH_PX, small.height_px)
     framed: list[Any] = []
@@ -112,13 +102,8 @@ def _width_m(eye_m: F64, fov_deg: float) -> float:
 
 
 def _is_ambiguous(left: U8, right: U8, matched: F64) -> NDArray[np.bool_]:
-    """Return a mask of the pixels with an ambiguous match, as in a repetitive texture.
-
-    A match is ambiguous if another disparity fits almost as well. The matcher's own uniqueness test compares error
-    ratios, so it fails if the smallest error is 0.
-
-    Args:
-        matched: (h, w) disparities found by the matcher, in pixels.
+    """Return a mask of the pixels where another disparity fits almost as well as `matched` (h, w), as in repetitive
+    textures. The matcher's own uniqueness test compares error ratios, so it fails if the smallest error is 0.
     """
     there = right.astype(np.float32)
     halves = (there + np.roll(there, 1, 1)) / 2, (there + np.roll(there, -1, 1)) / 2
@@ -138,12 +123,8 @@ def _is_ambiguous(left: U8, right: U8, matched: F64) -> NDArray[np.bool_]:
 def disparity_doubts(
     pictures: Sequence[U8 | F32], eyes_m: Eyes, stack: PanelStack, *, fov_deg: float, parallel: bool = True
 ) -> list[str]:
-    """Return a one-line warning, in a list, if the pictures will cause ghosts, or an empty list.
-
-    Args:
-        pictures: Left and right (h, w, 3) picture, each from a camera at the eye that is aimed at the stack's origin.
-        parallel: True if the pictures might be a rectified pair from parallel cameras, passed by mistake. The warning
-            says so if the disparities suggest it.
+    """Return a one-line warning, in a list, if the pictures will cause ghosts, or an empty list. `parallel`: they may
+    be a rectified pair from parallel cameras, passed by mistake; the warning says so if it seems so.
     """
     line = eyes_m[1] - eyes_m[0]
     if line[1] <= 0 or abs(line[2]) > ROLLED * line[1] or abs(line[0]) > TURNED * line[1]:

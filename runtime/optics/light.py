@@ -65,18 +65,14 @@ def squared_errors(
     fov_deg: float,
     sampling: Sampling,
 ) -> F64:
-    """Return the mean squared errors of the light that reaches the eyes, compared with carried targets.
+    """Return the mean squared errors (1 + groups,) of the light that reaches the eyes, compared with carried targets.
 
     A carried target is a picture treated as if it were painted on the centre panel (docs/contracts.md). A pixel counts
-    if all its rays cross every panel at least half a pixel inside the panel's edge.
+    if all its rays cross every panel at least half a pixel inside the panel's edge. The first error is over all rows,
+    and the others over interleaved groups of rows; their scatter gives the standard error. An error of nearly perfect
+    light can be negative because the rays are random.
 
-    Returns:
-        (1 + groups,) errors. The first is over all rows. Each of the others is over one of the interleaved groups of
-        rows; their scatter gives the first one's standard error. If the light is nearly perfect, an error can be
-        negative because the rays are random.
-
-    Raises:
-        ValueError: An eye is not in front of every panel, or no pixel counts.
+    Raises ValueError if an eye is not in front of every panel, or no pixel counts.
     """
     cores, step = len(os.sched_getaffinity(0)), sampling.step
     parts = -(-min(len(target) for target in targets) // step) if sampling.groups else 4 * cores
@@ -119,13 +115,8 @@ def _squared_error(
 def view_of(
     side: int, nominal_m: F64, true_m: F64, target: F32, stack: PanelStack, *, fov_deg: float, pupil_mm: float
 ) -> LightView:
-    """Return one eye's target and rays.
-
-    Args:
-        pupil_mm: Pupil diameter. If 0, the eye is a pinhole.
-
-    Raises:
-        ValueError: The nominal eye, or a point on the true eye's pupil, is not in front of every panel.
+    """Return one eye's target and rays. The eye is a pinhole if `pupil_mm`, its diameter, is 0. Raises ValueError if
+    the nominal eye or a point on the true eye's pupil is not in front of every panel.
     """
     height, width = target.shape[:2]
     rays = Rays.of_eye(checked_eye(nominal_m, stack), width_px=width, height_px=height, fov_deg=fov_deg)
@@ -141,11 +132,7 @@ def first_ray(side: int) -> int:
 
 
 def panels_from_centre(true_m: F64, stack: PanelStack) -> F64:
-    """Return the homographies from centre-panel pixels to the pixels of every layer.
-
-    Returns:
-        (..., N, 3, 3) homographies along each eye's rays.
-    """
+    """Return the (..., N, 3, 3) homographies from centre-panel pixels to every layer's pixels along each eye's rays."""
     centre = stack.panel(stack.count // 2)
     matrices = np.stack([centre.to(stack.panel(n), true_m) for n in range(stack.count)], axis=-3)
     if stack.tilt is not None:

@@ -10,10 +10,7 @@ from runtime.optics.stack import PlaneRaster
 
 @dataclass(frozen=True, slots=True)
 class PixelRect:
-    """Rectangle of raster pixels, with u0 <= u < u1 and v0 <= v < v1.
-
-    u points right and v points down. The rectangle is empty if u1 <= u0 or v1 <= v0.
-    """
+    """Raster pixels with u0 <= u < u1 (right) and v0 <= v < v1 (down); empty if u1 <= u0 or v1 <= v0."""
 
     u0: int
     v0: int
@@ -65,10 +62,7 @@ class PixelRect:
 
 
 def union(boxes: Sequence[PixelRect]) -> PixelRect:
-    """Return the smallest rectangle that contains every non-empty rectangle.
-
-    If all the rectangles are empty, so is the result.
-    """
+    """Return the smallest rectangle that contains every non-empty rectangle, or an empty one."""
     filled = [box for box in boxes if box.width_px and box.height_px]
     if not filled:
         return PixelRect(0, 0, 0, 0)

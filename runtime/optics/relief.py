@@ -27,23 +27,14 @@ COARSE_RIM_PX = 1  # RIM_PX for coarse rasters, whose reliefs have fewer pixels
 
 
 def block_px(width_px: int) -> int:
-    """Return the side, in raster pixels, of the square block covered by one relief pixel.
-
-    A coarse raster uses the same number, although its pixels are larger.
-    """
+    """Return the side of a relief pixel's block in raster pixels: the same number on a coarse raster."""
     return -(-width_px // WIDEST_PX)
 
 
 def relief_of(nearness: Sequence[F32], *, distance_m: Sequence[float], rim_px: int = RIM_PX) -> F32:
-    """Combine the depth seen by the two eyes into one (h, w) relief.
-
-    Each pixel takes whichever eye's relief has the larger magnitude. The background has relief 0, and so have pixels
-    whose distance is not a finite number.
-
-    Args:
-        nearness: For each eye, the (h, w) inverse distances from the eye along x, in 1/m. The background is 0.
-        distance_m: Each eye's distance from the middle panel along x.
-        rim_px: Number of relief pixels that nearer content is dilated by.
+    """Combine the depth seen by the two eyes into one (h, w) relief: for each pixel, that with the larger magnitude.
+    `nearness` are inverse distances along x in 1/m, 0 for the background, and `distance_m` each eye's distance from the
+    middle panel. Nearer content is dilated by `rim_px` relief pixels. Relief that is not finite becomes 0.
     """
     rim = np.ones((2 * rim_px + 1,) * 2, np.uint8)
     reliefs = []
@@ -56,14 +47,8 @@ def relief_of(nearness: Sequence[F32], *, distance_m: Sequence[float], rim_px: i
 
 
 def parallax(stack: PanelStack, *, old_m: F64, new_m: F64) -> Parallax | None:
-    """Return how the content moves on the panels when the midpoint between the eyes moves.
-
-    Args:
-        old_m: (3,) midpoint that the layers were solved for, in frame `stack`.
-        new_m: (3,) current midpoint in frame `stack`.
-
-    Returns:
-        The motion, or None if the midpoint has not moved or there is no middle panel (an even number of panels).
+    """Return how the content moves when the midpoint between the eyes moves from `old_m` to `new_m`, in frame `stack`.
+    None if it has not moved, or if there is no middle panel (an even number of panels).
     """
     if stack.count % 2 == 0 or np.array_equal(old_m, new_m):
         return None

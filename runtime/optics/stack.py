@@ -33,11 +33,8 @@ class Plane:
     x_m: float
 
     def scale_shift_to(self, other: Plane, eye_m: ArrayLike) -> tuple[F64, F64]:
-        """Return the scales (...), and the shifts (..., 2) in metres, that project this plane onto another.
-
-        The ray from the eye (..., 3) through the point p on this plane crosses the other plane at p·scale + shift.
-
-        Raises ValueError if an eye is in this plane.
+        """Return the scales (...) and shifts (..., 2) in metres by which rays from eyes (..., 3) project this plane
+        onto another. The point p is projected to p·scale + shift. Raises ValueError if an eye is in this plane.
         """
         eye = np.asarray(eye_m, np.float64)
         distance_m = eye[..., 0] - self.x_m
@@ -57,9 +54,8 @@ class Plane:
 
 @dataclass(frozen=True, slots=True)
 class PlaneRaster:
-    """Pixel grid on the plane x = x_m in frame `stack`. u points along +y (right) and v along -z (down).
-
-    The pixel position (u, v) lies at y = left_m + u·pitch_u_m and z = top_m - v·pitch_v_m.
+    """Pixel grid on the plane x = x_m in `stack`: the pixel (u, v) is at y = left_m + u·pitch_u_m, z = top_m -
+    v·pitch_v_m.
     """
 
     x_m: float
@@ -75,18 +71,15 @@ class PlaneRaster:
         return Plane(self.x_m)
 
     def to(self, other: PlaneRaster, eye_m: ArrayLike) -> F64:
-        """Return the (..., 3, 3) maps to another raster's pixels along the rays of eyes (..., 3).
-
-        Raises ValueError if an eye is in this raster's plane.
+        """Return the (..., 3, 3) maps to another raster's pixels along the rays of eyes (..., 3). Raises ValueError if
+        an eye is in this raster's plane.
         """
         return np.asarray(other.raster_from_plane() @ self.plane.to(other.plane, eye_m) @ self.plane_from_raster())
 
     def to_and_back(self, via: Plane, *, old_m: Sequence[float], step_m: Sequence[float]) -> F64:
-        """Return the 3x3 map that projects pixels onto a plane from one eye, and back from another.
-
-        The first eye is at old_m + step_m, the second at old_m. The result is exactly the identity if the step is zero
-        or the plane is the raster's. `optics.alignment` derives the equation. Plain floats are several times as fast
-        here as small arrays.
+        """Return the 3x3 map of pixels onto a plane from the eye at old_m + step_m, and back from the eye at old_m.
+        Exactly the identity if the step is zero or the plane is the raster's. `optics.alignment` derives the equation.
+        Plain floats are several times as fast here as small arrays.
         """
         distance_m, height_m = old_m[0] - self.x_m, old_m[0] - via.x_m
         now_m = distance_m + step_m[0]
@@ -155,10 +148,7 @@ class PanelStack:
         return bool(gaps.size == 0 or np.ptp(gaps) <= UNEVEN_MOST * gaps.mean())
 
     def reduced(self, reduction: int) -> PanelStack:
-        """Return a stack with the same size in metres but fewer pixels.
-
-        The rows and columns are divided by `reduction`, with at least one of each left.
-        """
+        """Return a stack of the same size with 1/`reduction` of the rows and columns, at least one of each."""
         if reduction == 1:
             return self
         width_px, height_px = (max(1, round(px / reduction)) for px in (self.width_px, self.height_px))

@@ -35,11 +35,8 @@ def layer_pixels_from_seen(raster: PlaneRaster, layer_from_seen_m: F64) -> F64:
 
 
 def coarse_layer_from_seen(stack: PanelStack, index: int, eye_m: F64) -> F64:
-    """Return the simplest map that approximates `layer_from_seen` closely enough.
-
-    The candidates are tried in this order: the identity, a scale and shift (fast to resample), an affine map, and the
-    exact homography. The first one that deviates by at most `UNSEEN_PX` at nine points is returned. The points are the
-    panel's corners, the middles of its edges, and its centre.
+    """Return the simplest map that approximates `layer_from_seen` to `UNSEEN_PX` at nine points of the panel.
+    Candidates: the identity, a scale and shift (fast to resample), an affine map, and the exact homography.
     """
     if stack.tilt is None or not any(stack.tilt.depth[index]):
         return np.eye(3)
@@ -64,9 +61,8 @@ def _projected(
     eye: tuple[float, float, float],
     x_m: float,
 ) -> F64:
-    """Return the homography that projects the plane x = x_m onto the tilted plane and back.
-
-    The first projection follows rays from the eye, and the second follows rays from `seen_from`.
+    """Return the map that projects x = x_m onto the tilted plane along rays from `eye`, and back along those from
+    `seen_from`.
     """
     offset_m, right, up = depth
     normal, far = np.array([1.0, -right, -up]), x_m + offset_m

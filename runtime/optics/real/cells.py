@@ -30,10 +30,8 @@ Kind = Literal["rotator", "twisted-nematic", "half-wave", "variable-retarder"]
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """A panel's liquid-crystal cell. The defaults are the solver's ideal rotator.
-
-    For other kinds, `black_deg` and `white_deg` limit the angle by which the cell turns light that is polarized as the
-    rear polarizer transmits it.
+    """Liquid-crystal cell, by default the solver's ideal rotator. For other kinds, `black_deg` and `white_deg` limit
+    the angle by which the cell turns light that is polarized as the rear polarizer transmits it.
     """
 
     kind: Kind = "rotator"
@@ -109,12 +107,7 @@ def rotator(angle_rad: ArrayLike) -> C128:
 
 
 def retarder(delta_rad: ArrayLike, axis_rad: ArrayLike) -> C128:
-    """Return the matrices (..., 2, 2) of linear retarders.
-
-    Args:
-        delta_rad: Phase by which light polarized along the slow axis lags behind light polarized across it.
-        axis_rad: Angle of the slow axis, from x towards y.
-    """
+    """Return the (..., 2, 2) matrices of retarders with slow axis `axis_rad` from x towards y and lag `delta_rad`."""
     delta, axis = np.broadcast_arrays(np.asarray(delta_rad, np.float64), np.asarray(axis_rad, np.float64))
     c, s = np.cos(delta / 2), np.sin(delta / 2)
     along, across = np.cos(2 * axis), np.sin(2 * axis)
@@ -123,26 +116,19 @@ def retarder(delta_rad: ArrayLike, axis_rad: ArrayLike) -> C128:
 
 
 def retarder_between_quarter_waves(angle_rad: ArrayLike, dispersion: float = 1.0) -> C128:
-    """Return the matrices (..., 2, 2) of retarders at 0° between quarter-wave plates at ±45°.
+    """Return the (..., 2, 2) matrices of retarders at 0° between plates of `dispersion` quarter waves at ±45°.
 
-    This is how a cell with vertical or parallel alignment becomes a rotator: a retardance of twice the angle turns
-    any polarization by the angle, without residue where the plates are exact. The cell's own dispersion is left out
+    This is how a cell with vertical or parallel alignment becomes a rotator: a retardance of twice `angle_rad` turns
+    any polarization by that angle, without residue where the plates are exact. The cell's own dispersion is left out
     because its grey curve is calibrated in each band.
-
-    Args:
-        angle_rad: Rotation wanted, half of the cell's retardance.
-        dispersion: The plates' retardance, divided by a quarter wave.
     """
     first, last = (retarder(math.pi / 2 * dispersion, side * math.pi / 4) for side in (1, -1))
     return np.asarray(last @ retarder(2 * np.asarray(angle_rad, np.float64), 0.0) @ first)
 
 
 def twisted_nematic(twist_rad: ArrayLike, beta_rad: ArrayLike) -> C128:
-    """Return the matrices (..., 2, 2) of uniformly twisted cells whose entrance director is along x.
-
-    Args:
-        twist_rad: Twist from entrance to exit, from x towards y.
-        beta_rad: Half of the cell's retardance, π·d·Δn/λ.
+    """Return the (..., 2, 2) matrices of cells with a uniform twist from x towards y, and a retardance π·d·Δn/λ of
+    `beta_rad`.
     """
     twist, beta = np.broadcast_arrays(np.asarray(twist_rad, np.float64), np.asarray(beta_rad, np.float64))
     gamma = np.sqrt(twist**2 + beta**2)
@@ -155,15 +141,10 @@ def twisted_nematic(twist_rad: ArrayLike, beta_rad: ArrayLike) -> C128:
 def twisted_retardance(angles_rad: F64, mauguin: float, wavelength_nm: float) -> F64:
     """Return the half-retardances beta of a cell with a twist of 90 degrees, for each panel value.
 
-    The voltages are those at which a cell at the first Gooch-Tarry minimum (at `DESIGN_NM`) has the intensities of the
-    grey curve between crossed polarizers, calibrated in this band. A cell with half-retardance beta transmits
-    1 - (twist·sin(gamma)/gamma)² there, with gamma² = twist² + beta². A cell of another thickness has a retardance in
-    proportion to it.
-
-    Args:
-        angles_rad: For each panel value, the angle whose sin² is the intensity of the grey curve.
-        mauguin: The cell's Mauguin parameter without voltage, at `DESIGN_NM`.
-        wavelength_nm: The band's wavelength.
+    The voltages are those at which a cell at the first Gooch-Tarry minimum (at `DESIGN_NM`) has the intensities
+    sin²(`angles_rad`) between crossed polarizers, calibrated in this band. It transmits 1 - (twist·sin(gamma)/gamma)²
+    there, with gamma² = twist² + beta². Retardance is proportional to thickness; `mauguin` is the parameter without
+    voltage, at `DESIGN_NM`.
     """
     betas = np.linspace(0.0, math.pi / 2 * FIRST_MINIMUM * min(DESIGN_NM / wavelength_nm, 1.0), 4096)
     gamma = np.sqrt((math.pi / 2) ** 2 + betas**2)

@@ -56,19 +56,9 @@ class RealLight(NamedTuple):
 
 
 def real_light(layers: U8, stack: PanelStack, real: RealPanels, sight: Sight, sampling: RealSampling) -> RealLight:
-    """Measure layers on real panels.
-
-    Intensities are relative to full white, averaged over the picture in each band: eyes and cameras adapt to a darker
-    or tinted display, but not to dark corners or moiré.
-
-    Args:
-        layers: (N, H, W, 3 or 4) code values, rear to front.
-        real: Imperfections.
-        sight: Eyes and targets.
-        sampling: Rays to trace.
-
-    Raises:
-        ValueError: An eye is not in front of every panel, or no pixel counts, or `real` does not fit the stack.
+    """Measure layers on real panels, relative to full white, averaged over the picture in each band. Eyes and cameras
+    adapt to a darker or tinted display, but not to dark corners or moiré. Raises ValueError if an eye is not in front
+    of every panel, no pixel counts, or `real` does not fit the stack.
     """
     real.check(stack.count)
     tables = Tables(layers, stack, real)
