@@ -42,16 +42,12 @@ class LayerSlots:
     """Layers in memory that a solver's process shares with the presenter's.
 
     A slot is free for the solver until the solver hands it over by `hand_over`. From then on only the presenter reads
-    it, and the solver does not write to it until the presenter has no view of it any more. So a solution
-    that was being written when the solver was killed is in a slot that was never handed over.
+    it, and the solver does not write to it until the presenter has no view of it any more. So a solution that was being
+    written when the solver was killed is in a slot that was never handed over.
     """
 
     def __init__(self, descriptor: int, stack: PanelStack) -> None:
-        """Map the memory.
-
-        Args:
-            descriptor: File descriptor of shared memory with `bytes_of(stack)` bytes.
-        """
+        """Map the shared memory with `bytes_of(stack)` bytes that a file descriptor refers to."""
         memory = np.frombuffer(mmap.mmap(descriptor, self.bytes_of(stack)), np.uint8)
         self._states, self._memory = memory[: mmap.PAGESIZE], memory[mmap.PAGESIZE :].reshape(SLOTS, -1)
         self._begun = self._memory.ctypes.data
@@ -66,10 +62,7 @@ class LayerSlots:
     # For the solver's process:
 
     def take(self, shape: tuple[int, ...]) -> LayerBuffer | None:
-        """Return a free slot, or None if all are in use.
-
-        The contents are those of an earlier solution of the same shape, or opaque white.
-        """
+        """Return a free slot or None. It contains an earlier solution of the same shape, or opaque white."""
         free = [index for index in range(SLOTS) if self._is_free(index)]
         users = self._users
         alike = [index for index in free if index in users and users[index].pixels.shape == shape]
@@ -85,11 +78,8 @@ class LayerSlots:
         return users[index]
 
     def hand_over(self, layers: U8) -> tuple[int, tuple[int, ...]] | None:
-        """Hand layers over to the presenter, and return their slot and shape.
-
-        Layers outside of a slot are copied.
-
-        Returns None if no slot is free for the copy.
+        """Hand layers, copied unless in a slot, over to the presenter; return their slot and shape, or None if none is
+        free.
         """
         index, offset = divmod(layers.ctypes.data - self._begun, self._memory.shape[1])
         if offset or not 0 <= index < SLOTS:
@@ -137,12 +127,7 @@ class LayerPool:
     """Buffers for all solutions in use: the one being computed, the newest, and the one on the panels."""
 
     def __init__(self, stack: PanelStack, slots: LayerSlots | None = None) -> None:
-        """Create an empty pool.
-
-        Args:
-            stack: Panels, with the raster of the solutions.
-            slots: Shared memory to take the buffers from. None takes them from this process's own memory.
-        """
+        """Create an empty pool for solutions on the stack's raster, in shared memory if there are slots."""
         self._shape, self._slots = (stack.count, stack.height_px, stack.width_px, 4), slots
         self._buffers: list[LayerBuffer] = []
 

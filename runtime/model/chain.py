@@ -45,9 +45,8 @@ Columns = NDArray[np.floating[Any]]
 
 @dataclass(frozen=True, slots=True)
 class ColumnLaw:
-    """Conversion between a raster's columns u and the coordinate t used by homographies.
-
-    t = middle + (1 - exp(-bend·(u - middle)))/bend. If the bend is 0, t = u.
+    """Columns u as t = middle + (1 - exp(-bend·(u - middle)))/bend, the homographies' coordinate; t = u if the bend is
+    0.
     """
 
     bend: float = 0.0  # per column
@@ -76,9 +75,8 @@ BEYOND_F = 1e-9  # lower limit for the logarithm's argument
 
 @dataclass(frozen=True, slots=True)
 class ChainFrame:
-    """Raster on the plane where the two outer panels have equal and opposite parallaxes.
-
-    The homographies apply to points (t, v, 1), where v is the row, and `columns` converts the column u to t.
+    """Raster on the plane where the two outer panels have equal and opposite parallaxes. The homographies apply to
+    points (t, v, 1), where v is the row, and `columns` converts the column u to t.
     """
 
     x_m: float  # the plane's x coordinate in frame `stack`
@@ -104,17 +102,12 @@ class ChainFrame:
         return np.asarray(inverse / inverse[2, 2], np.float64)
 
     def eye_sigma_px(self, stack: PanelStack, *, eye_sigma_m: float, cell_px: int) -> F32:
-        """Return the three lengths that the network needs as input, as a (3,) array.
+        """Return the three lengths (3,) that the network needs as input, given the tracking error's standard deviation.
 
-        The first two are how far a tracking error of one standard deviation moves the outer panels' pictures, along and
-        across the rows. The third is the centre panel's parallax relative to the raster's plane, along the rows.
-        Lengths along the rows are in units of the outer panels' parallax divided by `cell_px`, and lengths across the
-        rows are in rows.
-
-        Args:
-            stack: Stack that the raster was made for.
-            eye_sigma_m: Standard deviation of the tracking error.
-            cell_px: Divisor stated in the model's contract.
+        The first two are how far this error moves the outer panels' pictures, along and across the rows. The third is
+        the centre panel's parallax relative to the raster's plane, along the rows. Lengths along the rows are in units
+        of the outer panels' parallax divided by `cell_px`, from the model's contract, and lengths across the rows are
+        in rows.
         """
         reach = (stack.x_m[-1] - self.x_m) / (self.middle_m[0] - stack.x_m[-1])
         centre = (self.x_m - stack.x_m[1]) / (self.middle_m[0] - stack.x_m[1])
@@ -129,18 +122,12 @@ class ChainFrame:
 
 
 def chain_frame(eyes_m: Eyes, stack: PanelStack, *, most_cell_px: int, reduction: int) -> ChainFrame:
-    """Return the raster for a pair of eyes.
+    """Return the raster for a pair of eyes, with rows of `reduction` panel rows, sheared along the line of the eyes.
 
-    The raster covers the part of the panels that the eyes see through all of them, plus a margin. Its rows are sheared
-    along the line of the eyes. The outer panels' parallax is the smallest whole number of columns that makes a column
-    at most `WIDEST` wide, but no more than `most_cell_px` columns.
-
-    Args:
-        most_cell_px: The outer panels' maximum parallax, in raster columns (K).
-        reduction: Row height in panel rows. If the eyes are not level, rows may be taller.
-
-    Raises:
-        ValueError: The eyes are not horizontally separated, or the raster would be implausibly tall.
+    It covers the part of the panels that the eyes see through all of them, plus a margin. The outer panels' parallax is
+    the smallest whole number of columns that makes a column at most `WIDEST` wide, but at most `most_cell_px` (K). If
+    the eyes are not level, rows may be taller. Raises ValueError if the eyes are not horizontally separated, or the
+    raster would be implausibly tall.
     """
     between_m, half_m = eyes_m.mean(axis=0), (eyes_m[1] - eyes_m[0]) / 2
     plane_m = _equal_parallax_m(stack, between_m[0])
@@ -210,9 +197,8 @@ class _Window:
 
 @dataclass(frozen=True, slots=True)
 class _LineOfEyes:
-    """The point F where the line through the eyes meets the raster's plane.
-
-    F is at (y, z) = towards_f_m2 / nearer_m. This form remains valid if F is infinitely far away.
+    """The point F at (y, z) = towards_f_m2 / nearer_m, possibly infinitely far, where the eyes' line meets the raster's
+    plane.
     """
 
     nearer_m: float  # half the difference in x between the eyes, right minus left; 0: F is treated as infinitely far
@@ -222,10 +208,7 @@ class _LineOfEyes:
 
 
 def _line_of_eyes(between_m: F64, half_m: F64, *, plane_m: float, window: _Window) -> _LineOfEyes:
-    """Return the point F for eyes at between_m ± half_m.
-
-    If F is too close to the window or too far from it, it is treated as infinitely far.
-    """
+    """Return the point F for eyes at between_m ± half_m, infinitely far if it is too close to the window or too far."""
     nearer_m, ahead_m = float(half_m[0]), between_m[0] - plane_m
     towards = nearer_m * between_m[1:] - ahead_m * half_m[1:]
     from_f = nearer_m * window.middle_m - towards
@@ -239,9 +222,8 @@ def _line_of_eyes(between_m: F64, half_m: F64, *, plane_m: float, window: _Windo
 
 
 def _equal_parallax_m(stack: PanelStack, eye_x_m: float) -> float:
-    """Return x for the plane where the two outer panels have equal and opposite parallaxes.
-
-    If both gaps are a and the eyes are a distance e from the centre panel, the plane is a²/e in front of that panel.
+    """Return x for the plane where the two outer panels have equal and opposite parallaxes. If both gaps are a and the
+    eyes are a distance e from the centre panel, the plane is a²/e in front of that panel.
     """
     rear_m, front_m, far_m = stack.x_m[1] - stack.x_m[0], stack.x_m[2] - stack.x_m[1], eye_x_m - stack.x_m[1]
     ahead = 2 * rear_m * front_m + far_m * (front_m - rear_m)
@@ -249,9 +231,8 @@ def _equal_parallax_m(stack: PanelStack, eye_x_m: float) -> float:
 
 
 def _window_of(middle: F64, stack: PanelStack, *, plane_m: float) -> _Window:
-    """Return the part of the raster's plane crossed by rays from `middle` (3,) through all panels.
-
-    Its height corresponds to the centre panel's height. Its width is at least 10 % of the panel width.
+    """Return the part of the raster's plane crossed by rays from `middle` (3,) through all panels. Its height
+    corresponds to the centre panel's height. Its width is at least 10 % of the panel width.
     """
 
     def extent(x_m: float, size_m: float, axis: int) -> tuple[float, float]:
@@ -268,14 +249,11 @@ def _window_of(middle: F64, stack: PanelStack, *, plane_m: float) -> _Window:
 
 @lru_cache(maxsize=8)
 def chain_modes(cells: int) -> tuple[F32, F32, F32, F32]:
-    """Return the chain operators' modes for `cells` equations.
+    """Return V, Ũ (cells + 1, cells + 1), s (cells + 1,) and U^T (cells + 1, cells): the chain operators' modes.
 
     The (cells, cells + 1) difference operator A, with rows [.. -2 2 ..], is U·diag(s)·V^T. The mean operator B, with
     rows [.. 1/2 1/2 ..], is U·diag(cos)·Ũ^T, where cos = sqrt(1 - s²/16). The modes are known in closed form: they are
     sines and cosines of the same frequencies. A maps the first mode of V to 0.
-
-    Returns:
-        V (cells + 1, cells + 1), Ũ (cells + 1, cells + 1), s (cells + 1,) and U^T (cells + 1, cells) as float32.
     """
     angle = np.pi * np.arange(cells + 1) / (cells + 1)
     size = np.sqrt(2 / (cells + 1))
@@ -291,9 +269,8 @@ def chain_modes(cells: int) -> tuple[F32, F32, F32, F32]:
 
 @lru_cache(maxsize=8)
 def cell_waves(cell_px: int) -> tuple[F32, F32]:
-    """Return the (2K, 2K) orthonormal real Fourier basis on a cell's columns, and its (2K,) frequencies.
-
-    Each row of the basis is one wave. Frequencies are in radians per parallax, that is, per `cell_px` (K) columns.
+    """Return an orthonormal real Fourier basis (2K, 2K) of a cell's columns, a wave per row, and its (2K,) frequencies.
+    Frequencies are in radians per parallax, that is, per `cell_px` (K) columns.
     """
     size = 2 * cell_px
     at = np.arange(size)

@@ -17,13 +17,9 @@ class SolverState(Protocol):
     """One stack's panels on one device, kept between frames. A state may be used by only one thread."""
 
     def begin(self, job: Job, geometry: Geometry, *, resumed: bool = False) -> AbstractContextManager[None]:
-        """Load a job's targets. All other methods must be called within the returned context.
-
-        Until a panel is set, all pixels in its box have the rest value.
-
-        Args:
-            resumed: True to keep the panels and the momentum of the previous solution, which must have had the same
-                geometry.
+        """Load a job's targets, for all other methods to be called within the returned context. Until a panel is set,
+        all pixels in its box have the rest value. If `resumed`, the panels and the momentum of the previous solution
+        are kept, which must have had the same geometry.
         """
 
     def set_panel(self, panel: int, codes: I16) -> None:
@@ -42,12 +38,8 @@ class SolverState(Protocol):
         """Update all panels once (docs/mathematics.md, L5)."""
 
     def write(self, buffer: LayerBuffer, outside: int | tuple[int, ...] | None) -> None:
-        """Write all panels to a buffer as 8-bit codes.
-
-        Args:
-            outside: What to write to the middle panel outside its box: a panel code, or a colour that the eyes should
-                see. The outer panels get the rest code outside their boxes. If None, the buffer keeps its contents
-                outside the boxes.
+        """Write all panels to a buffer as 8-bit codes. If `outside` is None, it keeps its contents outside the boxes.
+        Otherwise, `outside` is a middle-panel code, or a colour that the eyes should see there; the outer panels rest.
         """
 
     def close(self) -> None:
@@ -64,7 +56,4 @@ class SolverBackend(Protocol):
         """Create the state for a stack. Raises InputError if the panels are too large for the device."""
 
     def close(self) -> None:
-        """Release the resources shared by the states.
-
-        All states must be closed first. May be called more than once.
-        """
+        """Release what the states share, once these are closed. May be called more than once."""

@@ -58,11 +58,7 @@ class TargetView:
 
 
 class RaySets(NamedTuple):
-    """The ray sets of one step.
-
-    Sets take turns from one picture row to the next: row k of the rays of a set with turn t is picture row
-    `turns`·k + t.
-    """
+    """The ray sets of one step, which take turns: row k of a set's rays with turn t is picture row `turns`·k + t."""
 
     panels_from_rays: F64  # (E, N, 3, 3) homographies from a set's rays to pixels in the panels' boxes
     views: tuple[int, ...]  # (E,) each set's view
@@ -89,10 +85,7 @@ class Geometry:
 
     @property
     def missing_weight(self) -> float:
-        """Weight given to rays that miss another panel's box when the middle panel is solved.
-
-        In a tapered window, these rays keep their full weight.
-        """
+        """Weight of rays that miss another panel's box when the middle panel is solved: full in a tapered window."""
         return 1.0 if any(self.taper_px) else MISSING_WEIGHT
 
     def is_like(self, other: Geometry) -> bool:
@@ -110,14 +103,9 @@ class Geometry:
         return tuple(box.cut(self.stack.panel(n)) for n, box in enumerate(self.boxes))
 
     def ray_sets(self, places: Places, eye_sigma_m: float) -> RaySets:
-        """Return one step's ray sets: every view at 1 or 2 head positions, which take turns.
-
-        If the views belong to several points of each pupil, these take turns too, so that a step costs the same.
-
-        Args:
-            places: Head positions assumed by the step.
-            eye_sigma_m: Standard deviation of the tracking error. It is limited so that all assumed eyes are in front
-                of the panels.
+        """Return one step's ray sets: every view at 1 or 2 head positions, which take turns. If the views belong to
+        several points of each pupil, these take turns too, so that a step costs the same. The tracking error's
+        `eye_sigma_m` is limited so that all assumed eyes are in front of the panels.
         """
         eye_sigma_m = self._possible_m(eye_sigma_m)
         sure = self.rays.height_px == 1 or self._moved_px(eye_sigma_m) < KNOWN_PX
@@ -134,11 +122,8 @@ class Geometry:
         return self._sets([range(len(self.eyes_m))], np.zeros((1, 2)))
 
     def _sets(self, shown: Sequence[range], moved_m: F64) -> RaySets:
-        """Return ray sets.
-
-        Args:
-            shown: For each turn, its views.
-            moved_m: For each turn, the distance (right, up) between the assumed and the tracked head position.
+        """Return ray sets, given, for each turn, its views and the head's distance (right, up) from the tracked
+        position.
         """
         right, up = stack_from_eye(self.eyes_m.mean(axis=0))[:3, 0], np.array([0.0, 0.0, 1.0])
         turns, homographies = len(shown), []
@@ -168,9 +153,8 @@ class Geometry:
         return float(eye_sigma_m * max(shares) / pitch_m)
 
     def tapers(self) -> tuple[F32, F32]:
-        """Return the rays' weights by column (width,) and by row (height,).
-
-        The weights are 1 inside a window and fall to 0 at its edges, except where these are panel edges.
+        """Return the rays' weights by column and by row: 1 inside a window, falling to 0 at edges that are not a
+        panel's.
         """
         box, kept, matrix = self.boxes[self.middle], self.kept, self.middle_from_rays.mean(axis=0)
         width_px, height_px = self.rays.width_px, self.rays.height_px
@@ -199,16 +183,9 @@ def geometry_of(
     taper_px: tuple[float, float] = (0.0, 0.0),
     points: int = 1,
 ) -> Geometry:
-    """Return the geometry for those rays of all views that pass through a part of the middle panel.
-
-    Args:
-        views: What each eye should see.
-        boxes: Pixels to solve on each panel.
-        kept: Part of the middle panel that the rays pass through. By default, the middle panel's box.
-        taper_px: Width of a window's taper, right and down, in middle-panel pixels.
-        points: Points of each pupil that have separate views.
-
-    Raises ValueError if the views' pictures differ in size.
+    """Return the geometry for the rays that pass through a part of the middle panel, by default its box. `boxes` are
+    the pixels to solve on each panel, `taper_px` a window's taper, right and down, in middle-panel pixels, and `points`
+    the points of each pupil that have separate views. Raises ValueError if the views' pictures differ in size.
     """
     box = boxes[stack.count // 2]
     kept = kept or box
@@ -231,15 +208,7 @@ def _snapped(homography: F64) -> F64:
 
 
 def _looked_through(pictures_from_middle: F64, box: PixelRect, shape: tuple[int, ...]) -> PixelRect:
-    """Return the smallest rectangle that contains every picture pixel whose ray passes through a box.
-
-    A pixel counts if its ray passes through the box for at least one eye.
-
-    Args:
-        pictures_from_middle: For each eye, the homography from middle-panel pixels to picture pixels.
-        box: Middle-panel pixels.
-        shape: The pictures' shape (h, w, ...).
-    """
+    """Return the smallest rectangle of picture pixels whose rays pass a middle-panel box for at least one eye."""
     height, width = shape[:2]
     corners = np.array([[box.u0, box.u1, box.u0, box.u1], [box.v0, box.v0, box.v1, box.v1], [1.0] * 4])
     centre = np.array([(box.u0 + box.u1) / 2, (box.v0 + box.v1) / 2, 1.0])
@@ -255,13 +224,8 @@ def _looked_through(pictures_from_middle: F64, box: PixelRect, shape: tuple[int,
 
 
 def panel_from_middle(stack: PanelStack, rasters: Sequence[PlaneRaster], eye_m: F64, n: int) -> F64:
-    """Return the 3x3 homography from the middle panel's pixels to panel `n` along an eye's rays.
-
-    The homography is a scale and a shift unless the panels are tilted (`optics.tilt`). Its last entry is 1.
-
-    Args:
-        rasters: Each panel's pixel grid, which may cover only a part of the panel.
-        eye_m: (3,) eye in frame `stack`.
+    """Return the 3x3 homography, 1 in its last entry, from middle-panel pixels to panel `n`'s along an eye's rays. A
+    scale and a shift unless the panels are tilted (`optics.tilt`). Rasters may cover only a part of their panels.
     """
     target = rasters[n]
     matrix = rasters[stack.count // 2].to(target, eye_m)
@@ -271,9 +235,8 @@ def panel_from_middle(stack: PanelStack, rasters: Sequence[PlaneRaster], eye_m: 
 
 
 def visible_boxes(eyes_m: Eyes, stack: PanelStack) -> tuple[PixelRect, ...]:
-    """Return, for each panel, the padded box of pixels that an eye sees through all the other panels.
-
-    If the eyes see nothing through all the panels, there is nothing to solve, and the boxes have the minimum size.
+    """Return, for each panel, the padded box of pixels that an eye sees through all the other panels. If the eyes see
+    nothing through all panels, the boxes have the minimum size.
     """
     planes, half = [Plane(x_m) for x_m in stack.x_m], np.array([stack.width_m, stack.height_m]) / 2
     middle = planes[stack.count // 2]
@@ -305,14 +268,8 @@ def _span(low: float, high: float, size: int) -> tuple[int, int]:
 
 
 def taper(at_px: F64, first: int, last: int, size: int, over_px: float) -> F32:
-    """Return weights that rise linearly from 0 at two limits to 1 between them.
-
-    The weights reach 1 at a distance of `over_px` from a limit.
-
-    Args:
-        at_px: Positions to compute the weights at.
-        first: Lower limit. If it is the panel's edge (0), the weights do not fall towards it.
-        last: Upper limit. If it is the panel's edge (`size`), the weights do not fall towards it.
+    """Return weights that rise linearly from 0 at two limits to 1 within `over_px`, except at panel edges (0 and
+    `size`).
     """
     weights = np.ones(len(at_px))
     if over_px > 0 and first > 0:

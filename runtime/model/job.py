@@ -26,11 +26,7 @@ VIEWS_MOST = 8  # maximum number of views in a job
 
 @dataclass(frozen=True, slots=True)
 class SolveWindow:
-    """A window to solve on all panels.
-
-    Outside the window, the outer panels keep the rest value that the solver starts from, and the middle panel shows the
-    picture that both eyes see.
-    """
+    """A window to solve on all panels. Outside, the outer panels rest, and the middle one shows what both eyes see."""
 
     box: PixelRect  # pixels on every panel; if empty, nothing is solved
     kept: PixelRect  # pixels inside `box` to solve on the middle panel; the others show what both eyes see
@@ -143,12 +139,7 @@ class Job:
 def drawn_views(
     pictures: Sequence[U8 | DrawnPicture], stack: PanelStack, window: SolveWindow | None = None
 ) -> tuple[TargetView, ...]:
-    """Return the views for pictures drawn on the middle panel's pixels.
-
-    Args:
-        pictures: Each eye's (h, w, 3 or 4) picture.
-        window: Window covered by the pictures. If None, they cover the whole panel.
-    """
+    """Return the views for each eye's picture drawn on the pixels of the middle panel, or of a window of it."""
     raster = stack.panel(stack.count // 2)
     if window is not None:
         raster = window.box.cut(raster)
@@ -156,11 +147,7 @@ def drawn_views(
 
 
 def drawn_job(pictures: Sequence[U8 | DrawnPicture], eyes_m: Eyes, stack: PanelStack) -> Job:
-    """Return a job, without a window, for pictures drawn on the middle panel's pixels.
-
-    Args:
-        pictures: Each eye's (h, w, 3 or 4) picture.
-    """
+    """Return a job, without a window, for each eye's picture drawn on the middle panel's pixels."""
     return Job(Targets(stack, eyes_m, drawn_views(pictures, stack)))
 
 

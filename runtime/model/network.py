@@ -31,10 +31,8 @@ class PictureProposal:
     any_raster = False  # the network can propose only whole panels of one size
 
     def __init__(self, session: ModelSession, stack: PanelStack, *, source: Path) -> None:
-        """Create the proposal.
-
-        Raises:
-            InputError: The contract requires another panel size or layout, or the graph's ports have unexpected shapes.
+        """Create the proposal. Raises InputError if the contract requires another panel, or the graph's ports do not
+        fit.
         """
         contract = session.contract
         self.session, self._stack = session, stack
@@ -85,15 +83,7 @@ class PictureProposal:
         }
 
     def _seen(self, job: Job, n: int, side: int) -> U8:
-        """Warp an eye's picture to panel `n`'s pixels, making it black outside the field of view.
-
-        Args:
-            side: 0 for the left eye, 1 for the right eye.
-
-        Returns:
-            An (h, w, 3 or 4) picture. If the contract does not limit the field of view, the picture's edge is repeated
-            outwards.
-        """
+        """Warp an eye's picture to panel `n`'s pixels, black outside a field of view that the contract limits."""
         stack, eye_m, view, middle = self._stack, job.eyes_m[side], job.views[side], self._stack.count // 2
         rasters, size = [stack.panel(n) for n in range(stack.count)], (stack.height_px, stack.width_px)
         panel_from_mid = panel_from_middle(stack, rasters, eye_m, n) if n != middle else np.eye(3)

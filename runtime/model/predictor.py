@@ -19,10 +19,7 @@ SUMS = "SHA256SUMS"  # file with the shipped models' digests, in sha256sum forma
 
 
 def model_path(name: str) -> Path | None:
-    """Return a model's file, or None for `sart`, which has no file.
-
-    Raises InputError if `name` is neither a known model nor an ONNX file.
-    """
+    """Return a model's file, or None for `sart`. Raises InputError if `name` is neither known nor an ONNX file."""
     if name == "sart":
         return None
     if name in SHIPPED:
@@ -34,10 +31,7 @@ def model_path(name: str) -> Path | None:
 
 
 def shipped_sha256(name: str) -> str:
-    """Return the SHA-256 of a shipped model's file, or an empty string for other models.
-
-    Raises InputError if the shipped model is missing from the list of digests.
-    """
+    """Return the SHA-256 of a shipped model's file, "" for others. Raises InputError if a shipped one is not listed."""
     if name not in SHIPPED:
         return ""
     table = Path(str(resources.files("runtime.model") / "data" / SUMS))
@@ -49,17 +43,11 @@ def shipped_sha256(name: str) -> str:
 
 
 def load_predictor(name: str, stack: PanelStack, settings: ModelSettings | None = None) -> Predictor:
-    """Load a model for a stack.
+    """Load a model, by the name of a shipped one, `sart`, or the path of an ONNX file, for a stack.
 
     Shipped networks need three panels with gaps that are equal to within `UNEVEN_MOST`. For other stacks, the network
-    is not used: steps start from panels at the rest value, and `Predictor.name` says so.
-
-    Args:
-        name: Name of a shipped model, `sart`, or the path of an ONNX file.
-
-    Raises:
-        InputError: The name is unknown, the file is not a valid model, or the model does not support the stack.
-        MissingPart: The compiled kernels or the configured onnxruntime provider are missing or do not start.
+    is not used: steps start from panels at the rest value, and `Predictor.name` says so. Raises InputError if the model
+    is unknown, not valid or does not support the stack, and MissingPart if the kernels or the provider do not work.
     """
     keep_freed_memory()
     try:

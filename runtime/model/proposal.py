@@ -58,18 +58,9 @@ class Proposal(Protocol):
     session: ModelSession
 
     def panels(self, job: Job, geometry: Geometry, watch: Stopwatch) -> dict[int, I16]:
-        """Return the values proposed for the panels' boxes.
-
-        Args:
-            watch: Stopwatch to add the times of the stages "prepare" and "inference" to.
-
-        Returns:
-            For each proposed panel, the (rows, columns[, 3]) values in its box, in sixteenths of a code. Panels without
-            a proposal stay at the rest value.
-
-        Raises:
-            ModelFailure: Inference failed or returned numbers that are not finite.
-            EyesNotServed: The network does not support the job's eye positions.
+        """Return the values (rows, columns[, 3]) proposed for panels' boxes, in sixteenths of a code; other panels
+        rest. Times are added to `watch` as "prepare" and "inference". Raises ModelFailure and EyesNotServed as
+        `Predictor.solve`.
         """
 
 
@@ -149,10 +140,9 @@ class ChainProposal:
         return dict(zip(outer, panels, strict=True))
 
     def _target_codes(self, view: TargetView, channels: int) -> tuple[I16, F64]:
-        """Return the target sum of panel values for each pixel in a view, and the view's inverse homography.
-
-        The sums are in sixteenths of a code and may differ from the true sums by a constant. The 3x3 inverse homography
-        maps points (y, z, 1) on the middle panel's plane to view pixels.
+        """Return the target sum of panel values for each pixel in a view, and the view's inverse homography. The sums
+        are in sixteenths of a code and may differ from the true sums by a constant. The 3x3 inverse homography maps
+        points (y, z, 1) on the middle panel's plane to view pixels.
         """
         codes = cv2.LUT(without_alpha(view.pixels, channels), self._codes)
         return np.asarray(codes, np.int16), np.asarray(np.linalg.inv(view.plane_from_picture), np.float64)
@@ -173,13 +163,8 @@ class ChainProposal:
 
 
 def tapered(codes: I16, n: int, geometry: Geometry, *, middle_m: F64 | None = None) -> I16:
-    """Fade an outer panel's values to the rest value at the edges of the geometry's window.
-
-    Args:
-        codes: Values (rows, columns[, 3]) of panel `n`'s box.
-        n: The panel. The middle panel is returned unchanged.
-        geometry: Geometry with the window.
-        middle_m: (3,) point in frame `stack` to project the window from. By default, the middle of the eyes.
+    """Fade the values (rows, columns[, 3]) of an outer panel's box to the rest value at the edges of the window. The
+    window is projected from `middle_m`, by default the middle of the eyes.
     """
     if max(geometry.taper_px) <= 0 or n == geometry.middle:
         return codes
@@ -191,10 +176,7 @@ def tapered(codes: I16, n: int, geometry: Geometry, *, middle_m: F64 | None = No
 
 
 def _residual(own: I16, other: I16) -> I16:
-    """Return half the difference between one eye's targets and the other's, sharpened.
-
-    Apart from the sharpening, the result is 0 where one of the eyes sees nothing (`UNSEEN`).
-    """
+    """Return half the difference between two eyes' targets, sharpened, from 0 where one sees nothing (`UNSEEN`)."""
     half = np.asarray(cv2.subtract(own, other), np.int16) >> 1
     # Rays outside one eye's picture have no residual.
     np.copyto(half, 0, where=cv2.min(own, other) < 0)
@@ -202,16 +184,8 @@ def _residual(own: I16, other: I16) -> I16:
 
 
 def _with_raster(geometry: Geometry, *, whole: bool, most_cell_px: int, reduction: int) -> tuple[_Local, ChainFrame]:
-    """Return the panels and their raster, transposed if this considerably reduces the raster's height.
-
-    Args:
-        geometry: Geometry for the whole panels.
-        whole: True to solve the whole panels, False to solve only the window.
-        most_cell_px: As for `chain_frame`.
-        reduction: As for `chain_frame`.
-
-    Raises:
-        ValueError: `chain_frame` refuses the eyes in both orientations.
+    """Return the panels, all or the window's, and their raster, transposed if this makes it considerably less tall.
+    Raises ValueError if `chain_frame` refuses the eyes in both orientations.
     """
     choices: list[tuple[float, _Local, ChainFrame]] = []
     refusals: list[ValueError] = []
@@ -260,14 +234,8 @@ def _left_first(eyes_m: Eyes) -> tuple[F64, tuple[int, int]]:
 
 
 def _wave_taper(geometry: Geometry, raster: PlaneRaster, middle_m: F64) -> F32:
-    """Return the (rows, columns) weights used to taper the proposal for an outer panel.
-
-    The weights are 1 inside the window and fall to 0 at its edges. Positions are projected from the outer panel to the
-    centre panel along rays from `middle_m`.
-
-    Args:
-        raster: Pixels in the outer panel's box.
-        middle_m: (3,) point between the eyes in frame `stack`.
+    """Return weights (rows, columns) of an outer panel's box: 1 inside the window, falling to 0 at its edges. Positions
+    are projected to the centre panel along rays from `middle_m`, the point between the eyes.
     """
     stack, kept = geometry.stack, geometry.kept
     centre = stack.panel(stack.count // 2)

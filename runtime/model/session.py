@@ -45,16 +45,9 @@ class ModelSession:
     """A loaded model. `run` binds buffers once for each combination of shapes and then reuses them."""
 
     def __init__(self, path: Path, *, provider: str = "cpu", threads: int = 2, sha256: str = "") -> None:
-        """Load a model and check it.
-
-        Args:
-            provider: Key of `PROVIDERS`.
-            sha256: The file's expected digest. If empty (unknown), the file is first loaded in a child process.
-
-        Raises:
-            InputError: The file is not an ONNX model that onnxruntime can load, a digest is wrong, or the contract is
-                missing or does not fit the graph.
-            MissingPart: The provider is not installed or does not start.
+        """Load a model and check it; a file whose digest `sha256` is not known is first loaded in a child process.
+        Raises InputError if it is not a loadable ONNX model, its digest is wrong, or its contract is missing or does
+        not fit, and MissingPart if the provider (of `PROVIDERS`) does not work.
         """
         ort = onnxruntime()
         name, package = PROVIDERS[provider]
@@ -95,16 +88,8 @@ class ModelSession:
         self._bound: dict[tuple[Any, ...], tuple[Any, dict[str, Any], dict[str, Any]]] = {}
 
     def run(self, feeds: Mapping[str, NDArray[Any]], shapes: Mapping[str, Shape]) -> dict[str, NDArray[Any]]:
-        """Run the model and return its outputs, keyed by name.
-
-        The outputs are the session's own buffers. Their contents are valid until the next run with the same shapes.
-
-        Args:
-            feeds: Inputs, keyed by name.
-            shapes: Output shapes, keyed by name.
-
-        Raises:
-            ModelFailure: onnxruntime failed.
+        """Run the model on inputs by name, and return outputs of these shapes, valid until the next run with the same.
+        Raises ModelFailure if onnxruntime failed.
         """
         key = (*((name, array.shape) for name, array in feeds.items()), *shapes.items())
         try:
@@ -152,16 +137,8 @@ class ModelSession:
                     raise InputError(path, f"{field}.{item.name}", problem)
 
     def check_fits(self, source: Path, feeds: Mapping[str, Shape], answers: Mapping[str, Shape]) -> None:
-        """Check the shapes of the graph's inputs and outputs against the expected ones.
-
-        If the graph does not specify every size, the model is run once to find out.
-
-        Args:
-            feeds: Expected input shapes, keyed by name.
-            answers: Expected output shapes, keyed by name.
-
-        Raises:
-            InputError: A shape is different, or the model does not run with these shapes.
+        """Check the shapes of the graph's inputs and outputs by name, if need be by running it. Raises InputError if
+        one differs, or the model does not run with these shapes.
         """
         is_open = False
         for field, items, shapes in (
@@ -198,13 +175,8 @@ class ModelSession:
 
 
 def nodes_elsewhere(session: Any, provider: str) -> tuple[str, ...]:
-    """Return the names of the graph nodes that do not run on the requested provider.
-
-    Only nodes left after onnxruntime's basic optimizations are considered. For a node without a name, its operator type
-    is returned.
-
-    Args:
-        session: An onnxruntime session created with the option `RECORD_NODES`.
+    """Return the names, or else operators, of graph nodes that do not run on the requested provider. The session needs
+    the option `RECORD_NODES`. Only nodes left after basic optimizations count.
     """
     return tuple(
         node.name or node.op_type
@@ -243,11 +215,8 @@ _tried_out: set[bytes] = set()  # digests of the files that have been loaded wit
 
 
 def _try_out(path: Path, data: bytes) -> None:
-    """Load a file in a child process with limited memory and time, unless this has already succeeded.
-
-    Limits are necessary because, as a model is loaded, a few bytes of constants can expand and fill all memory.
-
-    Raises InputError if the file cannot be loaded within the limits.
+    """Load a file once in a child process. Raises InputError if this exceeds limits on memory and time. Limits are
+    necessary because, as a model is loaded, a few bytes of constants can expand and fill all memory.
     """
     checksum = hashlib.sha256(data).digest()
     if checksum not in _tried_out:
@@ -263,10 +232,7 @@ def _tried_here(path: Path, data: bytes) -> None:
 
 
 def _why_not_loaded(error: Exception) -> str:
-    """Return the reason why onnxruntime failed to load a model.
-
-    If the model is too new, the reason gives its version and the newest version supported.
-    """
+    """Return why onnxruntime failed to load a model; if it is too new, its version and the newest supported."""
     text = str(error)
     for found in (NEWER_OPSET.search(text), NEWER_IR.search(text)):
         if found:

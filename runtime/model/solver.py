@@ -37,11 +37,7 @@ REFINING = (Step(size=0.8, places="falling"), Step(size=0.8, places="rising"))  
 
 
 def steps_from_even(steps: int) -> tuple[Step, ...]:
-    """Return the steps to run without a network, from panels that were solved on coarser rasters.
-
-    Args:
-        steps: Number of steps that the model runs when it can start from its network's proposal.
-    """
+    """Return the steps to run without a network, instead of `steps`, from panels solved on coarser rasters."""
     sizes = (1.2,) * (2 * steps) + (0.8,) * steps
     return tuple(Step(size=size, places=IN_TURN[n % 4]) for n, size in enumerate(sizes))
 
@@ -73,14 +69,8 @@ class StepPredictor(Predictor):
         threads: int = 2,
         backend: SolverBackend | None = None,
     ) -> None:
-        """Create the model.
-
-        Args:
-            proposal: Network that proposes the panels to start from. If None, they are solved on coarser rasters.
-            steps: Steps to run for a solution.
-            name: Model name to show to the user.
-            threads: Number of processor threads.
-            backend: Device that runs everything except the network. By default, the processor.
+        """Create a model that is shown to the user as `name`, by default on the processor. Without a proposal, the
+        panels to start from are solved on coarser rasters.
         """
         self.stack, self.name, self._proposal, self._steps = stack, name, proposal, tuple(steps)
         self._steps_from_even = self._steps if proposal is None else steps_from_even(len(self._steps))
@@ -158,13 +148,7 @@ class StepPredictor(Predictor):
         *,
         outside: int | tuple[int, ...] | None,
     ) -> _Done:
-        """Run steps starting from the proposal, or continue the previous solution if the rays are the same.
-
-        The result is written to `buffer`.
-
-        Args:
-            outside: What to write to the middle panel outside its box (`SolverState.write`).
-        """
+        """Run steps from the proposal, or the previous solution if the rays are the same, and write to `buffer`."""
         before = self._improved
         resumed = job.continued and before is not None and before[1] == job.channels and geometry.is_like(before[0])
         first = before[2] if before is not None and resumed else None

@@ -30,17 +30,9 @@ def solve_still(
     trimmed: bool = False,
     steps: int | None = None,
 ) -> Prediction:
-    """Compute the layers for pictures taken by cameras aimed at the stack's origin.
-
-    The cameras must have been at the eye positions. The solver follows the rays of the picture pixels.
-
-    Args:
-        *pictures: Each eye's (h, w, 3 or 4) picture.
-        eyes_m: (V, 3) eye positions in frame `stack`, in the order of the pictures.
-        fov_deg: The pictures' horizontal field of view.
-        eye_sigma_mm: Standard deviation of the tracking error.
-        trimmed: True to skip work that the pictures do not need (`trim`), if the model supports it.
-        steps: Number of steps. None: all of the model's.
+    """Compute the layers for each eye's picture, taken by a camera at the eye that is aimed at the stack's origin. The
+    solver follows the rays of the picture pixels. `trimmed` skips work that the pictures do not need, if the model
+    supports it; `steps` defaults to the model's.
     """
     watch = Stopwatch(*STAGES)
     codes = [np.ascontiguousarray(picture[..., :3]) for picture in pictures]
@@ -55,14 +47,7 @@ def solve_still(
 def captured_views(
     pictures: Sequence[U8], eyes_m: Eyes, stack: PanelStack, *, fov_deg: float
 ) -> tuple[TargetView, ...]:
-    """Return the views for captured pictures of one size.
-
-    Pictures are resized if their resolution differs from the panels'.
-
-    Args:
-        pictures: Each eye's (h, w, 3) picture, taken from the eye position with the camera aimed at the stack's origin.
-        fov_deg: The pictures' horizontal field of view.
-    """
+    """Return the views for pictures of one size, of cameras aimed at the origin, resized to the panels' pixels."""
     height, width = pictures[0].shape[:2]
     middle = stack.panel(stack.count // 2)
     at = [image_from_stack(eye_m, width_px=width, height_px=height, fov_deg=fov_deg) for eye_m in eyes_m]

@@ -3,6 +3,9 @@
 A window of the panels is equivalent to a smaller stack with its origin at the window's centre and the eyes shifted
 accordingly. Outside the window, the outer panels have the rest value, and the centre panel shows the picture. To avoid
 a visible seam, the outer panels' values are tapered to the rest value at the window's edge (`Geometry.tapers`).
+
+The previous solution's window, `before`, is kept if it still fits. There is None instead of a window if solving the
+whole panel would be as fast.
 """
 
 from __future__ import annotations
@@ -39,14 +42,7 @@ COMPARED = 2  # captured pictures are compared on a raster this many times as co
 
 
 def trim(job: Job, before: SolveWindow | None = None) -> Job:
-    """Return a job that solves only the necessary window and channels.
-
-    If the job has no window, the window where the eyes' pictures differ is used. If the pictures are grey there, a
-    single channel is solved.
-
-    Args:
-        before: The previous solution's window, which is kept if it still fits.
-    """
+    """Return a job that solves only its window, or where pictures differ, and one channel if they are grey."""
     window = job.window or differing_window(job, before)
     grey = (window is None or window.box.width_px > 0) and all(_is_grey(view, job, window) for view in job.views)
     return replace(job, window=window, channels=1 if grey else job.channels)
@@ -55,15 +51,8 @@ def trim(job: Job, before: SolveWindow | None = None) -> Job:
 def extent_window(
     extent: PixelRect, colour: tuple[int, ...], eyes_m: Eyes, stack: PanelStack, before: SolveWindow | None = None
 ) -> SolveWindow | None:
-    """Return the window for content with an extent that is known before the content is drawn.
-
-    Args:
-        extent: Middle-panel pixels. Outside them, both eyes see only the background.
-        colour: The background's 8-bit codes.
-        before: The previous solution's window, which is kept if it still fits.
-
-    Returns:
-        The window, or None if the extent is empty or solving the whole panel would be as fast.
+    """Return the window for content whose extent, in middle-panel pixels, is known before it is drawn. Outside, both
+    eyes see only the background, whose codes are `colour`. None also if the extent is empty.
     """
     if not extent.width_px:
         return None
@@ -73,10 +62,7 @@ def extent_window(
 
 
 def differing_window(job: Job, before: SolveWindow | None = None) -> SolveWindow | None:
-    """Return the window where the eyes' pictures differ. It is empty if the pictures agree.
-
-    Returns None if solving the whole panel would be as fast, or if a picture is in a texture.
-    """
+    """Return the window where pictures differ, empty if they agree. None also if a picture is in a texture."""
     if any(isinstance(view.picture, DrawnPicture) for view in job.views):
         return None
     stack = job.stack
@@ -111,10 +97,7 @@ def _on_middle_panel(view: TargetView, stack: PanelStack) -> bool:
 
 
 def _compared(job: Job) -> tuple[list[U8], tuple[int, int]]:
-    """Return the eyes' pictures on a coarse raster over the visible part of the middle panel.
-
-    The second value is the (column, row) of the panel pixel where the raster begins.
-    """
+    """Return pictures on a coarse raster of the middle panel's visible part, and that raster's first (column, row)."""
     visible = job.targets.visible
     box, middle = visible.boxes[visible.middle], job.stack.panel(visible.middle)
     size = max(1, box.height_px // COMPARED), max(1, box.width_px // COMPARED)
@@ -133,13 +116,7 @@ def _compared(job: Job) -> tuple[list[U8], tuple[int, int]]:
 def _window_around(
     box: PixelRect, eyes_m: Eyes, stack: PanelStack, before: SolveWindow | None, *, steep: float
 ) -> SolveWindow | None:
-    """Return the window for a box where the eyes' pictures differ.
-
-    Returns None if solving the whole panel would be as fast.
-
-    Args:
-        steep: `steepness` of the background around the box.
-    """
+    """Return the window for a box where pictures differ on a background with a `steepness`."""
     parallaxes = taper_parallaxes(steep)
     window = window_around(box, eyes_m, stack, parallaxes=parallaxes)
     if window is None:
@@ -160,14 +137,8 @@ def _is_grey(view: TargetView, job: Job, window: SolveWindow | None) -> bool:
 
 
 def differing_box(left: U8, right: U8, *, tolerance: int = TOLERANCE_CODES, known: PixelRect = NOWHERE) -> PixelRect:
-    """Return the smallest box that contains all the differences between two (h, w, 3 or 4) pictures.
-
-    The box is empty if the pictures agree.
-
-    Args:
-        tolerance: Largest difference to ignore, in codes.
-        known: Box that is known to be part of the result, such as the result of `coarse_box`. Only pixels outside it
-            are compared.
+    """Return the smallest box, maybe empty, of all differences above `tolerance` codes between (h, w, 3 or 4) pictures.
+    Pixels in `known`, a part of the result such as that of `coarse_box`, are not compared.
     """
     height, width = left.shape[:2]
 
@@ -180,9 +151,8 @@ def differing_box(left: U8, right: U8, *, tolerance: int = TOLERANCE_CODES, know
 
 
 def coarse_box(left: U8, right: U8, *, tolerance: int = TOLERANCE_CODES) -> PixelRect:
-    """Return a box that lies inside the result of `differing_box`, in a hundredth of the time.
-
-    Only a few pixels are compared, enough to tell if the window would be too large to be useful.
+    """Return a box inside the result of `differing_box`, in a hundredth of the time. Only a few pixels are compared,
+    enough to tell if the window would be too large to be useful.
     """
     few = [np.ascontiguousarray(picture[::COARSE_STEP, ::COARSE_STEP]) for picture in (left, right)]
     u0, v0, u1, v1 = (COARSE_STEP * corner for corner in _box(few[0], few[1], tolerance).corners)
@@ -197,29 +167,22 @@ def _box(left: U8, right: U8, tolerance: int) -> PixelRect:
 
 
 def parallax_margin_px(eyes_m: Eyes, stack: PanelStack) -> F64:
-    """Return how far rays through the middle panel's centre are shifted on each panel.
-
-    Returns:
-        (V, N, 2) shifts in pixels. The axes are the eye, the panel, and the direction (right, down). For rays through
-        other points on the middle panel, the shifts are approximate.
+    """Return (V, N, 2) shifts, right and down, of rays through the middle panel's centre on each panel, in pixels. For
+    rays through other points on the middle panel, they are approximate.
     """
     return _scale_shift_px(eyes_m, stack)[1]
 
 
 def steepness(codes: U8) -> float:
-    """Return how visible phase errors are on 8-bit codes, from 0 (black or white) to 1 (mid-grey).
-
-    The result is the root mean square of the slope of sin², 2·sqrt(I·(1 - I)).
+    """Return how visible phase errors are on 8-bit codes, from 0 (black or white) to 1 (mid-grey). The result is the
+    root mean square of the slope of sin², 2·sqrt(I·(1 - I)).
     """
     intensities = codes.astype(np.float64) / 255
     return float(np.sqrt((4 * intensities * (1 - intensities)).mean())) if codes.size else 0.0
 
 
 def steepness_beside(picture: U8, box: PixelRect) -> float:
-    """Return the larger `steepness` of the areas to the left and to the right of a box.
-
-    These are the areas where the outer panels are tapered. The picture has the shape (h, w, 3 or 4).
-    """
+    """Return the larger `steepness` of the areas left and right of a box, where the outer panels are tapered."""
     rows = slice(box.v0, box.v1, COARSE_STEP)
     beside = (picture[rows, : box.u0 : COARSE_STEP, :3], picture[rows, box.u1 :: COARSE_STEP, :3])
     return max(steepness(side) for side in beside)
@@ -238,13 +201,8 @@ def taper_px(eyes_m: Eyes, stack: PanelStack, *, parallaxes: float) -> tuple[flo
 
 
 def whole_rays(box: PixelRect, eyes_m: Eyes, stack: PanelStack) -> PixelRect:
-    """Return the part of a window where rays stay inside the window on every panel.
-
-    Rays may leave the window at panel edges.
-
-    Args:
-        box: Window in panel pixels.
-        eyes_m: (V, 3) eye positions in frame `stack` (not relative to the window).
+    """Return the part of a window, in panel pixels, where rays stay inside it on every panel, except at panel edges.
+    The eyes are not relative to the window.
     """
     scale, shift_px = _scale_shift_px(eyes_m, stack)
     limits = []
@@ -259,12 +217,8 @@ def whole_rays(box: PixelRect, eyes_m: Eyes, stack: PanelStack) -> PixelRect:
 
 
 def _scale_shift_px(eyes_m: Eyes, stack: PanelStack) -> tuple[F64, F64]:
-    """Return the maps from the centre panel to each panel along each eye's rays.
-
-    Pixels are measured from the panels' centres, right and down.
-
-    Returns:
-        Scales (V, N) and shifts (V, N, 2) in pixels.
+    """Return scales (V, N) and shifts (V, N, 2) from the centre panel to each along each eye's rays. Pixels are
+    measured from the panels' centres, right and down.
     """
     centre = Plane(stack.x_m[stack.count // 2])
     scales, shifts_m = zip(*(centre.scale_shift_to(Plane(x_m), eyes_m) for x_m in stack.x_m), strict=True)
@@ -273,15 +227,8 @@ def _scale_shift_px(eyes_m: Eyes, stack: PanelStack) -> tuple[F64, F64]:
 
 
 def window_around(box: PixelRect, eyes_m: Eyes, stack: PanelStack, *, parallaxes: float) -> PixelRect | None:
-    """Return the window needed to solve a box where the eyes' pictures differ.
-
-    The window includes margins, and its sides are rounded up to sixteenths of the panel's.
-
-    Args:
-        parallaxes: Taper width (`taper_parallaxes`).
-
-    Returns:
-        The window, or None if it would cover most of the panel. Solving the whole panel is then as fast.
+    """Return the window, with margins for a taper of `parallaxes`, to solve a box where pictures differ. Its sides are
+    rounded up to sixteenths of the panel's.
     """
     scale, shift_px = _scale_shift_px(eyes_m, stack)
     spans: list[tuple[int, int]] = []

@@ -23,12 +23,7 @@ _TRANSPOSED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 def source_px(image_from_raster: F64, size: tuple[int, int]) -> tuple[float, float]:
-    """Return how many image pixels a raster pixel spans at the centre, to the right and down.
-
-    Args:
-        image_from_raster: 3x3 homography from raster pixels to image pixels.
-        size: Raster width and height.
-    """
+    """Return how many image pixels a raster pixel spans, right and down, at the centre of a (width, height) raster."""
     a = image_from_raster
     x, y, w = a @ (size[0] / 2, size[1] / 2, 1.0)
     across, down = np.linalg.norm((a[:2, :2] - np.outer((x / w, y / w), a[2, :2])) / w, axis=0)
@@ -41,11 +36,7 @@ def resized_px(pixels: int, scale: float) -> int:
 
 
 def reduced_view(view: TargetView, middle: PlaneRaster, reduction: int) -> TargetView:
-    """Average a view's picture down to about one pixel per `reduction` x `reduction` panel pixels.
-
-    Args:
-        middle: The middle panel's pixel grid.
-    """
+    """Average a view's picture to about one pixel per `reduction` x `reduction` pixels of the middle panel's grid."""
     picture = view.pixels
     picture_from_middle = np.linalg.inv(view.plane_from_picture) @ middle.plane_from_raster()
     scales = source_px(picture_from_middle, (middle.width_px, middle.height_px))
@@ -64,15 +55,8 @@ def reduced_view(view: TargetView, middle: PlaneRaster, reduction: int) -> Targe
 def picture_on(
     view: TargetView, middle: PlaneRaster, *, middle_from_result: F64, edge: int, size: tuple[int, int]
 ) -> U8:
-    """Resample a view's (rows, columns, 3 or 4) picture to another raster.
-
-    If the picture's pixels already coincide with the raster's, the picture is returned unchanged.
-
-    Args:
-        middle: The middle panel's pixel grid.
-        middle_from_result: 3x3 homography from pixels on the new raster to middle-panel pixels.
-        edge: OpenCV's border mode.
-        size: Number of rows and columns in the new raster.
+    """Resample a view's picture to a raster of (rows, columns), unless its pixels already coincide. `middle` is the
+    middle panel's grid, `middle_from_result` the map to it, and `edge` OpenCV's border mode.
     """
     picture_from_result = np.linalg.inv(view.plane_from_picture) @ middle.plane_from_raster() @ middle_from_result
     picture_from_result = picture_from_result / picture_from_result[2, 2]
@@ -84,13 +68,7 @@ def picture_on(
 def resample(
     image: NDArray[Any], image_from_result: F64, *, size: tuple[int, int], edge: int = cv2.BORDER_CONSTANT
 ) -> NDArray[Any]:
-    """Sample an (h, w[, C]) image bilinearly on another raster.
-
-    Args:
-        image_from_result: 3x3 homography from raster pixels to image pixels. Pixel centres are at half-integers.
-        size: Number of rows and columns in the new raster.
-        edge: OpenCV's border mode.
-    """
+    """Sample an (h, w[, C]) image bilinearly at (rows, columns), with OpenCV's border mode."""
     at_centres = between_pixel_centres(image_from_result)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return np.asarray(cv2.warpPerspective(image, at_centres, size[::-1], flags=flags, borderMode=edge))
@@ -107,18 +85,11 @@ def warp(
     result_columns: ColumnLaw = EVEN_COLUMNS,
     threads: int | None = None,
 ) -> I16:
-    """Resample an (h, w[, 3]) int16 image as `resample` does, but several times as fast.
+    """Resample an (h, w[, 3]) int16 image, clipped to ±8191, as `resample` does, but several times as fast.
 
-    Args:
-        image: Image to resample. Its values are clipped to ±8191.
-        image_from_result: 3x3 homography from the result's columns and rows to the image's. For both, columns are given
-            by the coordinate t that their column law defines (`ColumnLaw`).
-        size: Number of rows and columns in the result.
-        outside: Value for pixels more than `reach_px` outside the image.
-        reach_px: How far the values at the image's edge are repeated outwards, at most REACH_PX.
-        image_columns: The image's column law. At least one of the two column laws must be even.
-        result_columns: The result's column law.
-        threads: Number of threads. By default, as many as OpenCV is configured to use.
+    The 3x3 homography maps columns, as the coordinates t of the column laws, of which one must be even, and rows of the
+    result, `size` (rows, columns), to the image's. Edges are repeated outwards for `reach_px`, at most `REACH_PX`;
+    beyond, the value is `outside`. There are as many threads as OpenCV uses, unless given.
     """
     x, y, w = image_from_result @ (result_columns.middle or size[1] / 2, size[0] / 2, 1.0)
     right, down = image_from_result[:2, 0] - np.array([x, y]) / w * image_from_result[2, 0]

@@ -20,12 +20,7 @@ from runtime.support.gl import DrawnPicture
 
 
 def raster_views(eyes_m: Eyes, raster: PlaneRaster, *, reduction: int = 1) -> tuple[View, View]:
-    """Return the left and the right eye's view, used to draw content on a raster.
-
-    Args:
-        raster: Pixels to draw on, usually the middle panel's.
-        reduction: The panels' number of rows and columns, divided by the raster's.
-    """
+    """Return both eyes' views, to draw content on a raster with 1/`reduction` of the panels' rows and columns."""
     left, right = (
         View(eye, side, raster_from_stack(eye, raster), raster.width_px, raster.height_px, reduction)
         for side, eye in enumerate(eyes_m)
@@ -34,13 +29,7 @@ def raster_views(eyes_m: Eyes, raster: PlaneRaster, *, reduction: int = 1) -> tu
 
 
 def retina_view(eye_m: F64, side: int, *, width_px: int, height_px: int, fov_deg: float) -> View:
-    """Return the view used to draw content as seen by an eye that looks at the stack's origin.
-
-    Args:
-        eye_m: (3,) eye in frame `stack`.
-        side: 0 for the left eye, 1 for the right eye.
-        fov_deg: The image's horizontal field of view.
-    """
+    """Return the view of an eye that looks at the stack's origin; side 0 is left, 1 right."""
     projection = image_from_stack(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
     return View(eye_m, side, projection, width_px, height_px)
 
@@ -48,13 +37,7 @@ def retina_view(eye_m: F64, side: int, *, width_px: int, height_px: int, fov_deg
 def retina_pictures(
     content: ContentSource, eyes_m: Eyes, stack: PanelStack, *, fov_deg: float, time_ns: int
 ) -> tuple[U8, U8]:
-    """Draw the (h, w, 3) pictures that the two eyes should see, with as many pixels as a panel.
-
-    Args:
-        eyes_m: (2, 3) left and right eye in frame `stack`. Each eye looks at the stack's origin.
-        fov_deg: The pictures' horizontal field of view.
-        time_ns: Time on the run's clock, for moving content.
-    """
+    """Draw the (h, w, 3) pictures that eyes looking at the origin should see, with as many pixels as a panel."""
     size = {"width_px": stack.width_px, "height_px": stack.height_px}
     views = [retina_view(eye, side, **size, fov_deg=fov_deg) for side, eye in enumerate(eyes_m)]
     content.expect(views, time_ns=time_ns)
@@ -73,22 +56,11 @@ def drawn_job(
     before: SolveWindow | None = None,
     in_depth: bool = False,
 ) -> Job:
-    """Draw content for both eyes on the middle panel's pixels, and return a job with the two pictures.
+    """Draw content for both eyes on the middle panel's pixels, reduced, and return a job with the two pictures.
 
-    Pictures that the content draws with OpenGL stay in textures if the model can read them. All other pictures are
-    arrays owned by the content source.
-
-    Args:
-        time_ns: Time on the run's clock, for moving content.
-        reduction: Number to divide the panels' rows and columns by.
-        trimmed: True to skip work that the scene does not need (`trim`). If the content knows its extent, the rest of
-            the picture is not even drawn.
-        before: The previous solution's window, on the same raster.
-        in_depth: True to include the content's relief, if the source knows the depth.
-
-    Raises:
-        ContentFailure: The content could not be drawn.
-        ContextLost: The OpenGL context was lost.
+    Pictures that the content draws with OpenGL stay in textures if the model can read them. `trimmed` skips work that
+    the scene does not need, even drawing outside a known extent; `before` is the previous window on this raster.
+    `in_depth` includes relief, if the depth is known. Raises ContentFailure if drawing fails, and ContextLost.
     """
     stack, trimmed = predictor.stack.reduced(reduction), trimmed and predictor.trims
     window: SolveWindow | None = None
@@ -112,10 +84,7 @@ def drawn_job(
 
 
 def _extent(content: ContentSource, eyes_m: Eyes, middle: PlaneRaster, *, time_ns: int) -> PixelRect | None:
-    """Return the middle-panel box to draw. Outside it, both eyes see only the background.
-
-    Returns None if the content does not know its extent.
-    """
+    """Return the middle-panel box outside which both eyes see only the background, or None if unknown."""
     views = raster_views(eyes_m, middle)
     boxes = [content.extent(view, time_ns=time_ns) for view in views]
     known = [box for box in boxes if box is not None]
@@ -125,14 +94,8 @@ def _extent(content: ContentSource, eyes_m: Eyes, middle: PlaneRaster, *, time_n
 def _relief(
     content: ContentSource, views: tuple[View, View], stack: PanelStack, window: SolveWindow | None, *, every: int
 ) -> F32 | None:
-    """Return the relief, on the middle panel, of the content drawn for both views.
-
-    Returns None if the content source does not know the depth.
-
-    Args:
-        views: The left and the right eye's view.
-        window: Window that was drawn on the middle panel. If None, the whole panel was drawn.
-        every: Side of a relief pixel, in panel pixels.
+    """Return the relief of content drawn for both views in a window or the whole, or None if the depth is unknown.
+    `every` is the side of a relief pixel, in panel pixels.
     """
     u0, v0 = (0, 0) if window is None else (window.box.u0, window.box.v0)
     left, right = (content.nearness(view, every=every, first=(u0 % every, v0 % every)) for view in views)
@@ -149,11 +112,8 @@ def _relief(
 
 
 def _drawn(predictor: Predictor, content: ContentSource, view: View, *, time_ns: int) -> U8 | DrawnPicture:
-    """Draw a view. Return a texture, or an array if the content does not draw with OpenGL.
-
-    Raises:
-        ContentFailure: The content could not be drawn.
-        ContextLost: Drawing failed in the OpenGL context used by the predictor.
+    """Draw a view to a texture, or an array if the content does not draw with OpenGL. Raises ContentFailure if drawing
+    fails, and ContextLost if it fails in the context used by the predictor.
     """
     try:
         picture = content.draw(view, time_ns=time_ns)

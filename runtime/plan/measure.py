@@ -55,11 +55,7 @@ class Measurement(NamedTuple):
 
 
 def measure(predictor: Predictor, content: ContentSource, eyes_m: Eyes, *, fov_deg: float) -> Measurement:
-    """Measure a scene with and without each saving.
-
-    Args:
-        fov_deg: Horizontal field of view of the pictures used to measure quality.
-    """
+    """Measure a scene with and without each saving; `fov_deg` is that of the pictures used for quality."""
     stack = predictor.stack
 
     def psnr_db(layers: U8, at_m: F64) -> float:
@@ -100,16 +96,9 @@ def measure(predictor: Predictor, content: ContentSource, eyes_m: Eyes, *, fov_d
 
 
 def plan_for(config: Path | None, *, scene: str | None, model: str | None, scale: float) -> dict[str, Any]:
-    """Measure a scene and return the table printed by `phasestack plan`.
-
-    Args:
-        config: Configuration file. If None, the default configuration is used.
-        scene: Scene that replaces the configured scene.
-        model: Model that replaces the configured model.
-        scale: Factor to multiply the panels' rows and columns by.
-
-    Raises:
-        PhasestackError: The configuration, the scene or the model cannot be used.
+    """Measure a scene and return the table printed by `phasestack plan`. Scene and model replace those configured;
+    `scale` multiplies the panels' rows and columns. Raises PhasestackError if the configuration, the scene or the model
+    cannot be used.
     """
     settings = with_options(load_settings(config), scene=scene, model=model)
     cv2.setNumThreads(settings.model.threads or -1)

@@ -43,23 +43,15 @@ class Plan:
 
 
 def eyes_in_range(eyes_m: Eyes, *, range_deg: float = VISIBLE_DEG) -> tuple[bool, bool]:
-    """Return, for each of the left and the right eye, True if it can see the display.
-
-    An eye can see the display if, viewed from the display's centre, it is within `range_deg` of the display's axis.
-    """
+    """Return, for each eye, True if it is within `range_deg` of the display's axis, seen from the display's centre."""
     off_axis = np.degrees(np.arctan2(np.linalg.norm(eyes_m[:, 1:], axis=1), eyes_m[:, 0]))
     left, right = (off_axis <= range_deg).tolist()
     return left, right
 
 
 def seeing_eyes(eyes_m: Eyes, before: tuple[bool, bool]) -> tuple[bool, bool]:
-    """Return, for each of the left and the right eye, True if it can see the display, with hysteresis.
-
-    An eye that was excluded is included again only once it is at least `RETURN_MARGIN_DEG` inside the range. Without
-    hysteresis, noise would switch an eye on and off at the limit of the range.
-
-    Args:
-        before: Previous result.
+    """Return, for each eye, True if it can see the display, given the previous result. An excluded eye must come
+    `RETURN_MARGIN_DEG` inside the range, so that noise does not switch it on and off.
     """
     outer = eyes_in_range(eyes_m)
     inner = eyes_in_range(eyes_m, range_deg=VISIBLE_DEG - RETURN_MARGIN_DEG)
@@ -68,13 +60,7 @@ def seeing_eyes(eyes_m: Eyes, before: tuple[bool, bool]) -> tuple[bool, bool]:
 
 
 def selected_eyes(eyes_m: Eyes, seeing: tuple[bool, bool]) -> F64:
-    """Return the (2, 3) eyes to draw and to solve for.
-
-    An eye that cannot see the display is replaced by the eye that can. If neither can, both eyes are returned.
-
-    Args:
-        seeing: For the left and the right eye, True if the eye can see the display (`seeing_eyes`).
-    """
+    """Return the (2, 3) eyes to draw and to solve for: one that cannot see is replaced by the other, if that can."""
     if seeing == (True, False):
         return eyes_m[[0, 0]]
     if seeing == (False, True):
@@ -90,13 +76,8 @@ def make_plan(
     seeing: tuple[bool, bool] | None = None,
     measured: Measured | None = None,
 ) -> Plan:
-    """Return the plan for a scene and a viewer. It is valid until the scene or the viewer changes.
-
-    Args:
-        eyes_m: (2, 3) left and right eye in frame `stack`. None if unknown.
-        seeing: For the left and the right eye, True if the eye can see the display (`seeing_eyes`). If None, this is
-            computed from `eyes_m`.
-        measured: Effects of the savings, to be quoted in the items.
+    """Return the plan for a scene and a viewer, valid until one of them changes. `seeing` is by default computed from
+    `eyes_m`. Items quote the `measured` effects of savings.
     """
     on, numbers = settings.plan.enabled, measured or Measured()
     if seeing is None and eyes_m is not None:

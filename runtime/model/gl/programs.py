@@ -34,14 +34,9 @@ class Image:
 
 
 def source(name: str, counts: Sequence[tuple[str, int]] = ()) -> str:
-    """Return a shader's source code with its included files inserted.
-
-    Lines between `#for NAME` and `#end` are repeated, with `@` replaced by 0, 1 and so on, because a shader cannot
-    choose an image by a number.
-
-    Args:
-        name: The shader's file name.
-        counts: How often to repeat the lines of each name.
+    """Return a shader's source code with its included files inserted. Lines between `#for NAME` and `#end` are repeated
+    as often as `counts` has it, with `@` replaced by 0, 1 and so on, because a shader cannot choose an image by a
+    number.
     """
 
     def read(file: str) -> str:
@@ -91,15 +86,8 @@ class Passes:
         counts: Counts = (),
         at: tuple[int, int, int, int] | None = None,
     ) -> None:
-        """Run a shader for every output pixel.
-
-        Args:
-            name: The fragment shader's name, without its suffix.
-            outputs: Images to write to.
-            inputs: Images, keyed by their names in the shader. Images that the shader does not use are ignored.
-            uniforms: Other uniforms, keyed by their names in the shader. Unused ones are ignored.
-            counts: How often to repeat the shader's repeated lines (`source`).
-            at: First column, first row, width and height of the area to draw. By default, all of the first output.
+        """Run a fragment shader for the output pixels of an area (first column and row, width, height), by default all.
+        Images and other uniforms are keyed by their names in the shader; unused ones are ignored.
         """
         program, array, held = self._program(name, counts)
         for unit, (key, image) in enumerate(inputs.items()):

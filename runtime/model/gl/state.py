@@ -31,18 +31,12 @@ MOST_SETS = 6  # maximum number of ray sets that a shader reads; every driver al
 
 
 class GlBackend:
-    """Backend that runs the solver in one OpenGL context.
-
-    All models that use the backend share its shader programs. Only the context's thread may use the backend.
-    """
+    """Backend in one OpenGL context, for its thread only, whose models share the shader programs."""
 
     name = "gl"
 
     def __init__(self, context: Any, stack: PanelStack) -> None:
-        """Create the backend. Raises InputError if a panel is too large for the driver.
-
-        The caller releases `context`.
-        """
+        """Create the backend; the caller releases `context`. Raises InputError if a panel is too large for it."""
         check_size(context, stack)
         self.context, self.passes = context, Passes(context)
 
@@ -58,10 +52,7 @@ class GlState:
     """`SolverState` for OpenGL. A state may be used only by the OpenGL context's thread."""
 
     def __init__(self, passes: Passes, stack: PanelStack) -> None:
-        """Create the state. Raises InputError if a panel is too large for the driver.
-
-        Several states may share `passes`.
-        """
+        """Create the state, which may share `passes`. Raises InputError if a panel is too large for the driver."""
         check_size(passes.context, stack)
         self._passes, self._stack, self._count = passes, stack, stack.count
         self._textures: dict[tuple[Any, ...], Any] = {}
@@ -148,9 +139,8 @@ class GlState:
     def _gathered(
         self, fields: Sequence[tuple[Image, Image]], sets: RaySets, n: int
     ) -> tuple[dict[str, Image], dict[str, Any], Counts]:
-        """Return the inputs, uniforms and counts with which a shader sums the ray sets' quantities at panel `n`.
-
-        If there are more sets than a shader can read, they are first collected in groups.
+        """Return the inputs, uniforms and counts with which a shader sums the ray sets' quantities at panel `n`. If
+        there are more sets than a shader can read, they are first collected in groups.
         """
         back = inverse(sets.panels_from_rays)[:, n]
         rays: tuple[int, int] = fields[0][0].size
@@ -194,10 +184,7 @@ class GlState:
             self._textures = {}
 
     def _loaded(self, view: TargetView, side: int) -> tuple[Image, tuple[int, int]]:
-        """Return the image with a view's target picture, and the (column, row) of the first ray in it.
-
-        If the picture is an array, it is uploaded to a texture.
-        """
+        """Return the image of a view's target picture, uploaded if an array, and the (column, row) of its first ray."""
         rays = self._geometry.rays
         if isinstance(view.picture, DrawnPicture):
             texture = view.picture.texture
