@@ -33,11 +33,7 @@ class EyeFinder:
     """
 
     def __init__(self, settings: Settings | None = None) -> None:
-        """Create a finder.
-
-        Args:
-            settings: Settings. The `calibration` section contains the viewer's eye separation, if that is known.
-        """
+        """Create a finder. `settings.calibration` may have the viewer's eye separation."""
         settings = settings or Settings()
         self._new_depth = partial(FaceDepth, eye_distance_m=settings.calibration.ipd_m)
         self._finder = PupilFinder(lock_ns=LOCK_NS)
@@ -54,10 +50,8 @@ class EyeFinder:
         return self._finder.choice
 
     def find(self, frame: SensorFrame) -> EyePoints | None:
-        """Return the viewer's eyes in the sensor frame, or return None and store the cause in `reason`.
-
-        Args:
-            frame: Sample that contains colour and intrinsics. Depth is optional and must be registered to colour.
+        """Return the viewer's eyes in the sensor frame, or return None and store the cause in `reason`. The sample
+        needs colour and intrinsics; depth, if any, must be registered to colour.
         """
         self.pupils = None
         if frame.colour is None:
@@ -98,15 +92,9 @@ def _eye_points(pupils: Pupils, depths: EyeDepths, intrinsics: Intrinsics) -> Ey
 
 
 def covariance(point: F64, line: F64, sideways_m: float, up_m: float, along_m: float) -> F64:
-    """Return the (3, 3) covariance, in m², of the position of a point seen from the origin.
-
-    Args:
-        point: (3,) point in metres.
-        line: (3,) vector between the eyes. Its component perpendicular to the line of sight defines the sideways
-            direction.
-        sideways_m: Standard deviation along the sideways direction.
-        up_m: Standard deviation perpendicular to both the sideways direction and the line of sight.
-        along_m: Standard deviation along the line of sight.
+    """Return the (3, 3) covariance, in m², of the position of a point (3,) seen from the origin. The standard
+    deviations are along the part of `line` (3,) perpendicular to the line of sight, perpendicular to both, and along
+    the line of sight.
     """
     sight = point / np.linalg.norm(point)
     sideways = line - (line @ sight) * sight

@@ -44,11 +44,7 @@ class FaceDepth:
     """Estimator for the distance from the camera to one viewer's eyes. Each viewer needs a new instance."""
 
     def __init__(self, *, eye_distance_m: float = 0.0) -> None:
-        """Create an estimator.
-
-        Args:
-            eye_distance_m: The viewer's eye separation, or 0 to estimate it from the pictures.
-        """
+        """Create an estimator for a viewer's eye separation in metres, or 0 to estimate it from pictures."""
         self._known = eye_distance_m > 0
         self._distance, sigma = (eye_distance_m, KNOWN_SIGMA_M) if self._known else EYE_DISTANCE_M
         self._variance = sigma**2
@@ -59,12 +55,8 @@ class FaceDepth:
         self.has_measured = False
 
     def at(self, pupils: Pupils, depth_mm: U16 | None, intrinsics: Intrinsics, depth_from_colour: F64) -> EyeDepths:
-        """Estimate both eyes' distances from the camera in one picture.
-
-        Args:
-            depth_mm: (h, w) depth picture, where 0 means not measured. None if there is no depth picture.
-            intrinsics: The colour picture's intrinsics.
-            depth_from_colour: (2,) number of depth pixels per colour pixel in each direction.
+        """Estimate both eyes' distances from the camera in one colour picture with `intrinsics`. `depth_mm` (h, w) is 0
+        where not measured. `depth_from_colour` (2,) are depth pixels per colour pixel.
         """
         relief = pupils.mesh_px[:, 2]
         eyes = np.array([relief[list(corners)].mean() for corners in CORNERS])
@@ -104,11 +96,7 @@ class FaceDepth:
             self._variance += (PICTURE_SHARE**2 + turn**2) * self._distance**2
 
     def _learn(self, ratio: float) -> None:
-        """Estimate the eye separation from the irises, because their size varies the least between people.
-
-        Args:
-            ratio: Eye separation divided by the iris diameter in the current picture.
-        """
+        """Estimate the eye separation from its ratio to the iris diameter, which varies the least between people."""
         self._irises = [*self._irises[-99:], ratio]
         iris = IRIS_M * float(np.median(self._irises))
         weights = np.array([EYE_DISTANCE_M[1], IRIS_SIGMA * iris]) ** -2.0
@@ -118,15 +106,11 @@ class FaceDepth:
     def _measure(
         self, pupils: Pupils, depth_mm: U16, scale: F64, relief: F64, eyes: F64, tilts: tuple[F64, F64], away: float
     ) -> None:
-        """Update the estimate from a depth picture.
+        """Update the estimate from a depth picture with `scale` (2,) depth pixels per colour pixel.
 
-        Args:
-            scale: (2,) number of depth pixels per colour pixel in each direction.
-            relief: (468,) depths of the mesh points relative to the eyes' midpoint (positive behind it), in metres.
-            eyes: (2,) depths of the mesh's eyes relative to the eyes' midpoint (positive behind it), in metres.
-            tilts: Depths, in metres, that the rigid mesh points and the two eyes would have if they lay on a plane
-                perpendicular to the line of sight.
-            away: Distance of the eyes' midpoint, in eye separations.
+        `relief` (468,) and `eyes` (2,) are depths of the mesh points and the eyes behind the eyes' midpoint, in metres;
+        `tilts` are those that they would have on a plane perpendicular to the line of sight; `away` is the midpoint's
+        distance, in eye separations.
         """
         face, shape = _sampled(depth_mm, pupils.mesh_px[RIGID, :2] * scale), relief[RIGID]
         good = face > 0
@@ -180,12 +164,7 @@ def _sampled(depth_mm: U16, points: F64) -> F64:
 
 
 def _window(depth_mm: U16, centre: F64, radius: float) -> F64:
-    """Return the (n,) depths of the pixels in a square window, in metres.
-
-    Args:
-        centre: (2,) window centre in pixels.
-        radius: Half the window's side, in pixels.
-    """
+    """Return the (n,) depths, in metres, in a square of pixels around `centre` (2,), `radius` half its side."""
     height, width = depth_mm.shape
     x0, y0 = np.clip(np.floor(centre - radius), 0, [width, height]).astype(int)
     x1, y1 = np.clip(np.floor(centre + radius) + 1, 0, [width, height]).astype(int)

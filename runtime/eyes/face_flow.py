@@ -37,24 +37,15 @@ class FaceFlow:
         self._mesh = np.zeros((0, 2))
 
     def remember(self, picture: U8, mesh: F64, eye_distance: float) -> None:
-        """Remember the face in a picture.
-
-        Args:
-            mesh: (468, 3) face mesh points, in pixels.
-            eye_distance: Eye separation in pixels.
-        """
+        """Remember the face in a picture, by its mesh (468, 3) and eye separation in pixels."""
         scale = EYE_DISTANCE / eye_distance
         offset = SIZE / 2 - scale * mesh[BRIDGE, :2]
         self._crop_from_picture = np.array([[scale, 0, offset[0]], [0, scale, offset[1]]])
         self._grey, self._mesh = self._crop(picture), mesh[RIGID, :2].copy()
 
     def moved(self, picture: U8, mesh: F64) -> F64 | None:
-        """Return the (2, 3) similarity that maps pixels in the remembered picture to pixels in a new one.
-
-        Returns None if too few points can be tracked or too few of them fit a similarity.
-
-        Args:
-            mesh: (468, 3) face mesh points in the new picture, in pixels.
+        """Return the (2, 3) similarity from the remembered picture's pixels to a new one's, with its mesh (468, 3).
+        None if too few points can be tracked or fit a similarity.
         """
         grey = self._crop(picture)
         matrix = self._crop_from_picture
@@ -79,14 +70,8 @@ class FaceFlow:
 
 
 def _flow(before: Any, after: Any, start: Any, guess: Any) -> tuple[Any, Any]:
-    """Track points from one grey picture to another.
-
-    Args:
-        start: (n, 2) positions of the points in `before`.
-        guess: (n, 2) initial estimates of the positions in `after`, which are overwritten.
-
-    Returns:
-        The (n, 2) positions in `after`, and an (n, 1) mask of the points that were found.
+    """Track points (n, 2) from one grey picture to another; return positions and an (n, 1) mask of those found. `guess`
+    are initial estimates of the positions, which are overwritten.
     """
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)
     ends, is_found, _ = cv2.calcOpticalFlowPyrLK(

@@ -45,12 +45,8 @@ class Models(NamedTuple):
 
     @classmethod
     def of(cls, *accelerations: Sequence[float], stay_s: float) -> Models:
-        """Stack the models of one or more quantities.
-
-        Args:
-            accelerations: For each quantity, the standard deviation of each model's acceleration along each axis, in
-                m/s².
-            stay_s: Mean time that a model applies before the motion switches to another.
+        """Stack the models of quantities, each with its models' deviations of acceleration along each axis, in m/s².
+        `stay_s` is the mean time that a model applies before the motion switches to another.
         """
         counts = [len(models) for models in accelerations]
         quantity = np.repeat(np.arange(len(counts)), counts)
@@ -91,9 +87,8 @@ def _products(series: F64) -> F64:
 
 
 def _series() -> tuple[F64, F64]:
-    """Return the (18, TERMS) coefficients of `_motion` for one axis and the (13, TERMS) coefficients of `_outlook`.
-
-    The variable of these power series is the time divided by `FADE_S`. Closed forms would suffer from cancellation.
+    """Return the (18, TERMS) coefficients of `_motion` for one axis and the (13, TERMS) coefficients of `_outlook`. The
+    variable of these power series is the time divided by `FADE_S`. Closed forms would suffer from cancellation.
     """
     power = np.arange(TERMS)
     decay = np.cumprod(np.r_[1.0, -1.0 / power[1:]])  # exp(-x)
@@ -121,10 +116,8 @@ def _powers(dt_s: float) -> F64:
 
 @lru_cache(maxsize=8)  # a simulated sensor's time steps recur
 def _motion(dt_s: float) -> F64:
-    """Return two (9, 9) matrices for the motion in `dt_s`.
-
-    The first one maps a state to the expected state. The second one is the covariance added by an acceleration noise
-    with a standard deviation of 1 m/s².
+    """Return two (9, 9) matrices for the motion in `dt_s`: to the expected state, and the covariance added. The
+    covariance is that of an acceleration noise with a standard deviation of 1 m/s².
     """
     along_one_axis = (_MOTION @ _powers(dt_s)).reshape(2, 3, 1, 3, 1)
     return (along_one_axis * _AXES[:, None, :]).reshape(2, 9, 9)
@@ -138,13 +131,8 @@ def _outlook(dt_s: float) -> tuple[F64, F64]:
 
 
 def started(places: F64, *, noise: F64, speeds: Sequence[float], models: Models) -> Belief:
-    """Return the belief after a first measurement, with a mean velocity of zero.
-
-    Args:
-        places: (quantities, 3) measured positions.
-        noise: (3, 3) covariance of each measured position.
-        speeds: Standard deviation of each quantity's velocity along each axis, in m/s.
-        models: The quantities' models.
+    """Return the belief after first positions (quantities, 3), each with covariance `noise`, and a mean velocity of
+    zero. `speeds` are the standard deviations of each quantity's velocity along each axis, in m/s.
     """
     count = len(models.quantity)
     state, covariance = np.zeros((count, 9)), np.zeros((count, 9, 9))
@@ -156,12 +144,7 @@ def started(places: F64, *, noise: F64, speeds: Sequence[float], models: Models)
 
 
 def predicted(belief: Belief, dt_s: float, *, models: Models) -> Belief:
-    """Return the belief after a time step. The models are first mixed, then propagated.
-
-    Args:
-        dt_s: Length of the time step, from 0 to LONGEST_S.
-        models: The belief's models.
-    """
+    """Return the belief after a time step of 0 to `LONGEST_S`: the models are first mixed, then propagated."""
     change = models.switched + math.exp(-dt_s / models.stay_s) * models.unswitched
     weight = change @ belief.weight
     shares = change * belief.weight / weight[:, None]  # (into, from)
@@ -175,17 +158,11 @@ def predicted(belief: Belief, dt_s: float, *, models: Models) -> Belief:
 
 
 def innovation(belief: Belief, measured: F64, *, noise: F64, models: Models) -> Innovation:
-    """Compare a measurement with each model's prediction.
+    """Compare measured positions (quantities, 3), each with covariance `noise`, with each model's prediction.
 
     The joint covariance of measurement and state has a Cholesky factor with three parts: the measurement's factor, the
     gain times this factor, and the factor of the corrected state's covariance, which thus stays positive definite. One
     more row of the factor becomes the innovation in units of the measurement's factor.
-
-    Args:
-        belief: The prediction.
-        measured: (quantities, 3) measured positions.
-        noise: (3, 3) covariance of each measured position.
-        models: The belief's models.
     """
     joint = np.zeros((len(models.quantity), 13, 13))
     joint[:, :3, :3] = belief.covariance[:, :3, :3] + noise
@@ -199,9 +176,8 @@ def innovation(belief: Belief, measured: F64, *, noise: F64, models: Models) -> 
 
 
 def _cholesky(covariance: F64) -> F64:
-    """Return the lower Cholesky factors of (n, k, k) covariances, of which the upper triangles are not used.
-
-    After a long jump, rounding can make a covariance indefinite. All variances are then raised.
+    """Return the lower Cholesky factors of (n, k, k) covariances, of which the upper triangles are not used. After a
+    long jump, rounding can make a covariance indefinite. All variances are then raised.
     """
     try:
         factor = np.linalg.cholesky(covariance)
@@ -211,22 +187,14 @@ def _cholesky(covariance: F64) -> F64:
 
 
 def surprise(seen: Innovation, *, models: Models) -> float:
-    """Return the squared Mahalanobis distance from the most surprising quantity to its nearest model.
-
-    For a good measurement of one quantity and the right model, this has a chi² distribution with three degrees of
-    freedom.
+    """Return the squared Mahalanobis distance from the most surprising quantity to its nearest model. It has a chi²
+    distribution with three degrees of freedom for a good measurement and the right model.
     """
     return float(np.minimum.reduceat(seen.chi2, models.first).max())
 
 
 def corrected(belief: Belief, seen: Innovation, *, models: Models) -> Belief:
-    """Return the belief after a measurement.
-
-    Args:
-        belief: The prediction.
-        seen: Difference between the measurement and the prediction.
-        models: The belief's models.
-    """
+    """Return the belief after a measurement that differs from the prediction by `seen`."""
     gain, rest, off = seen.factor[:, 3:12, :3], seen.factor[:, 3:12, 3:12], seen.factor[:, 12, :3]
     state = belief.state + (gain @ off[:, :, None])[:, :, 0]
     likely = -0.5 * seen.chi2 - np.log(seen.factor.diagonal(axis1=1, axis2=2)[:, :3]).sum(axis=1)

@@ -30,13 +30,7 @@ Motion = Callable[[F64], tuple[F64, F64]]
 
 
 def minimum_jerk(times_s: F64, *, knots_s: F64, values: F64) -> F64:
-    """Interpolate between stops with minimum-jerk movements (Flash and Hogan 1985).
-
-    Args:
-        times_s: (n,) times to interpolate at.
-        knots_s: (k,) times of the stops.
-        values: (k, ...) values at the stops.
-    """
+    """Interpolate values (k, ...) at stops by minimum-jerk movements (Flash and Hogan 1985) at times (n,)."""
     index = np.clip(np.searchsorted(knots_s, times_s, side="right") - 1, 0, len(knots_s) - 2)
     s = np.clip((times_s - knots_s[index]) / (knots_s[index + 1] - knots_s[index]), 0, 1)
     blend = s**3 * (10 + s * (6 * s - 15))
@@ -114,12 +108,7 @@ def path_of(seed: int) -> Path:
 
 
 def true_eyes(motion: str, times_s: F64, *, path: Path = BENCHMARK_PATH) -> F64:
-    """Return the (n, 2, 3) left and right eye positions during a motion, in metres, in frame `stack`.
-
-    Args:
-        motion: Name of a motion in `MOTIONS`.
-        times_s: (n,) times.
-    """
+    """Return the (n, 2, 3) eye positions in `stack` at times (n,) of one of `MOTIONS`."""
     neck, pitch = MOTIONS[motion](path.start_s + path.pace * times_s)
     neck, pitch = path.size * neck * [1.0, path.side, 1.0], path.size * pitch
     forward, _, up = NECK_TO_EYES_M
@@ -144,15 +133,9 @@ def observe(
     seed: int = 1,
     path: Path = BENCHMARK_PATH,
 ) -> list[Observation]:
-    """Simulate the samples taken by a sensor during a motion.
-
-    Args:
-        motion: Name of a motion in `MOTIONS`.
-        noise_m: Standard deviation of the noise for each eye along each axis.
-        outliers: Share of outliers among the samples. In an outlier, one or both eyes are displaced by 4 to 20 cm.
-        dropout_every_s: Time between dropouts. If 0, there are no dropouts.
-        seed: Seed for the noise, the outliers and their displacements.
-        path: Variation on the motion.
+    """Simulate the samples that a sensor takes of one of `MOTIONS`, on a variation of its path. `noise_m` is the
+    deviation for each eye along each axis. A share of `outliers` have one or both eyes displaced by 4 to 20 cm.
+    `dropout_every_s` is 0 for none.
     """
     random = np.random.default_rng([seed, *motion.encode(), round(rate_hz)])
     times_s = np.arange(round(seconds * rate_hz)) / rate_hz

@@ -26,13 +26,7 @@ CROP_BLUR = 0.45  # standard deviation of the anti-aliasing filter, in crop pixe
 
 
 def load_network(name: str) -> Any:
-    """Load a network into a single-threaded onnxruntime session.
-
-    The network is run once during loading, because the first run is slow.
-
-    Args:
-        name: Name of a file in the `models` folder.
-    """
+    """Load a file of the `models` folder into a single-threaded session, and run it once, which is slow."""
     ort = onnxruntime()
     options = ort.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
@@ -56,12 +50,8 @@ def inverse(matrix: F64) -> F64:
 
 
 def resampled(picture: U8, size: tuple[int, int], crop_from_picture: F64) -> U8:
-    """Crop and warp a picture with anti-aliasing. Outside the picture, its edge is repeated.
-
-    Args:
-        picture: RGB picture (h, w, 3).
-        size: Width and height of the result, in pixels.
-        crop_from_picture: (2, 3) affine matrix that maps the picture's continuous pixels to the result's.
+    """Crop and warp an RGB picture with anti-aliasing to (width, height), and repeat its edge outside.
+    `crop_from_picture` (2, 3) maps continuous pixels.
     """
     ratio = 1 / np.sqrt(abs(np.linalg.det(crop_from_picture[:, :2])))  # picture pixels per crop pixel
     corners = np.array([[0, 0], [size[0], 0], [0, size[1]], [size[0], size[1]]], np.float64)
@@ -87,12 +77,7 @@ class Square:
     angle: float  # direction of the lower edge, in radians clockwise on the screen
 
     def picture_from_crop(self, size: int, *, mirrored: bool = False) -> F64:
-        """Return the (2, 3) matrix that maps a crop's continuous pixels to the picture's.
-
-        Args:
-            size: Side of the crop, in pixels.
-            mirrored: True to mirror the crop horizontally.
-        """
+        """Return the (2, 3) matrix from a crop's continuous pixels, maybe mirrored, to the picture's."""
         c, s = np.cos(self.angle) * self.side / size, np.sin(self.angle) * self.side / size
         matrix = np.array([[-c if mirrored else c, -s], [-s if mirrored else s, c]])
         return np.column_stack([matrix, self.centre - matrix @ [size / 2, size / 2]])
@@ -132,13 +117,8 @@ class FaceNetwork:
         self._session = load_network("yunet.onnx")
 
     def find(self, picture: U8, *, longest_px: int, score_min: float) -> list[FoundFace]:
-        """Return the faces in a picture, ordered from the highest score to the lowest.
-
-        Args:
-            picture: RGB picture (h, w, 3).
-            longest_px: Maximum length of the picture's longer side. Larger pictures are reduced to this before the
-                search.
-            score_min: Minimum face score.
+        """Return the faces in an RGB picture, from the highest score down to `score_min`. If its longer side exceeds
+        `longest_px`, the picture is reduced to that before the search.
         """
         height, width = picture.shape[:2]
         scale = min(1.0, longest_px / max(height, width))
@@ -180,10 +160,7 @@ class MeshNetwork:
         self._session = load_network("face_mesh.onnx")
 
     def points(self, picture: U8, square: Square) -> tuple[F64, float]:
-        """Return the (468, 3) face points, and the probability that the square contains a face.
-
-        The points are in picture pixels, with z pointing away from the camera.
-        """
+        """Return the (468, 3) face points, in pixels with z away from the camera, and the probability of a face."""
         crop, matrix = square.crop(picture, self.SIZE)
         mesh, presence = self._session.run(None, {"input_1": crop})
         points = mesh.reshape(468, 3).astype(np.float64)
@@ -200,13 +177,8 @@ class IrisNetwork:
         self._session = load_network("iris.onnx")
 
     def points(self, picture: U8, square: Square, *, is_left: bool) -> tuple[F64, F64]:
-        """Return (5, 2) points on the iris and (16, 2) points on the lids, in picture pixels.
-
-        The first iris point is the centre, followed by four points on the edge. The lower lid comes before the upper
-        lid.
-
-        Args:
-            is_left: True for the viewer's left eye. The network's input is then mirrored.
+        """Return (5, 2) iris points, centre first, and (16, 2) points on the lower, then the upper lid, in pixels. The
+        input of the viewer's left eye is mirrored.
         """
         crop, matrix = square.crop(picture, self.SIZE, mirrored=is_left)
         names = ["output_iris", "output_eyes_contours_and_brows"]

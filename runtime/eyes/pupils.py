@@ -109,11 +109,7 @@ class PupilFinder:
     """
 
     def __init__(self, *, lock_ns: int = 0) -> None:
-        """Create a finder.
-
-        Args:
-            lock_ns: Time after which a viewer who is no longer seen may be replaced by another person.
-        """
+        """Create a finder. After `lock_ns`, a viewer who is no longer seen may be replaced by another person."""
         self._faces, self._meshes, self._irises = FaceNetwork(), MeshNetwork(), IrisNetwork()
         self._flow, self._lock_ns = FaceFlow(), lock_ns
         self.viewer = self._found_count = 0
@@ -135,12 +131,7 @@ class PupilFinder:
         self.reason, self.choice = "", "no viewer yet"
 
     def find(self, picture: U8, *, time_ns: int = 0) -> Pupils | None:
-        """Return the viewer's pupils in a picture, or return None and store the cause in `reason`.
-
-        Args:
-            picture: RGB picture (h, w, 3).
-            time_ns: The picture's capture time.
-        """
+        """Return the viewer's pupils in an RGB picture of `time_ns`, or None and store the cause in `reason`."""
         if self._looks is not None and time_ns - self._seen_ns > self._lock_ns:
             self._leave()
             self.choice = "the viewer has left"
@@ -227,10 +218,7 @@ class PupilFinder:
         return _Look(mesh, presence, eyes, iris, openness, _looks(picture, mesh, float(np.linalg.norm(line))))
 
     def _steadied(self, picture: U8, look: _Look, seen: Seen) -> Pupils:
-        """Return pupils with reduced jitter.
-
-        The previous picture's pupils are moved with the face, then corrected towards the networks' estimates.
-        """
+        """Return pupils with less jitter: the previous ones, moved with the face, corrected towards the networks'."""
         eyes, surprise, hidden = look.eyes.copy(), np.zeros(2), np.zeros(2, bool)
         last = self._last if self._steps else None
         if last is not None:
@@ -266,11 +254,7 @@ class PupilFinder:
 
 
 def _worth(face: FoundFace, middle: F64) -> float:
-    """Return a face's score as a possible viewer: its size, reduced towards the picture's edges.
-
-    Args:
-        middle: (2,) picture centre in pixels.
-    """
+    """Return a face's score as a possible viewer: its size, reduced away from the picture's `middle` (2,)."""
     away = np.abs(face.box[:2] + face.box[2:] / 2 - middle) / middle
     return face.size * (1 - FARTHEST_OUT * float(np.linalg.norm(away) / np.sqrt(2)))
 
@@ -286,10 +270,7 @@ def _square_of(mesh: F64) -> Square:
 
 
 def _looks(picture: U8, mesh: F64, eye_distance: float) -> F64:
-    """Return the (468,) grey values at face mesh points, which describe a person's appearance.
-
-    The values are normalized to mean 0 and norm 1, so that they do not depend on brightness or contrast.
-    """
+    """Return the (468,) grey values at mesh points, of mean 0 and norm 1, which describe a person's appearance."""
     margin = max(2, round(eye_distance / 4))
     height, width = picture.shape[:2]
     x0, y0 = np.clip(mesh[:, :2].min(axis=0).astype(int) - margin, 0, [width - 1, height - 1])

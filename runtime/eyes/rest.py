@@ -32,17 +32,10 @@ NEAREST_M = 0.1  # smaller distances from the display are raised to this
 
 
 class RestWatch:
-    """Detector that tells if a head is at rest, and where.
-
-    Not thread-safe. The time is taken from the samples; no clock is read.
-    """
+    """Detector that tells if a head is at rest, and where. Not thread-safe. Never reads a clock."""
 
     def __init__(self, *, max_drift_m: float) -> None:
-        """Create a detector.
-
-        Args:
-            max_drift_m: If the drift exceeds the noise by more than this, the resting head's position is updated.
-        """
+        """Create a detector that follows a resting head if the drift exceeds the noise by `max_drift_m`."""
         self._max_drift_m = max_drift_m
         self._times = np.zeros(2 * KEPT, np.int64)
         self._eyes = np.zeros((2 * KEPT, 2, 3))
@@ -105,10 +98,7 @@ class RestWatch:
         self.sigma_m = float(np.hypot(median_sigma_m, drift_m / 2**0.5))  # drift mostly goes in one direction
 
     def _measure_noise(self) -> None:
-        """Measure noise as each sample's distance from the line between its neighbours.
-
-        Steady motion does not affect this measure.
-        """
+        """Measure noise as each sample's distance from the line between its neighbours, also during steady motion."""
         first = max(0, self._count - KEPT // 2)
         times, shifts = self._times[first : self._count], _shifts(self._eyes[first : self._count], self._eyes[first])
         later = ((times[1:-1] - times[:-2]) / (times[2:] - times[:-2]))[:, None, None]  # neighbours may be missing
@@ -164,10 +154,9 @@ def _median(samples: F64) -> F64:
 
 
 def _shifts(eyes_m: Eyes, place: F64) -> F64:
-    """Return the (..., 2, 3) displacements of (..., 2, 3) samples from a (2, 3) place, as seen on the display.
-
-    Each eye has three displacements in metres: the effect of a change in the eye's distance on points away from the
-    display's centre, and to the right and up, as seen from the centre.
+    """Return the (..., 2, 3) displacements in metres of samples (..., 2, 3) from a place (2, 3), as seen on the
+    display. Each eye has three: the effect of a change in the eye's distance on points away from the display's centre,
+    and to the right and up, as seen from the centre.
     """
     shifts = eyes_m - place
     away, sideways = shifts[..., :1], shifts[..., 1:]

@@ -119,12 +119,7 @@ class _Shown:
     jump_ns: int
 
     def eyes_m(self, ahead_s: float, time_ns: int) -> F64:
-        """Return the (2, 3) eyes to show at a given time.
-
-        Args:
-            ahead_s: Time, after the newest sample, to predict the eyes for.
-            time_ns: Time when the eyes are shown, which determines how much of the jump is left.
-        """
+        """Return the (2, 3) eyes, predicted `ahead_s` after the newest sample, and the rest of a jump."""
         eyes = self.head.eyes_m(ahead_s)
         if self.jump_m is not NO_JUMP:
             fraction = min(max((time_ns - self.jump_ns) / NS_PER_S / REVIVE_S, 0.0), 1.0)
@@ -155,12 +150,8 @@ class Tracker:
         panel_m: tuple[float, float] = PANEL_M,
         in_front_m: float = 0.0,
     ) -> None:
-        """Create a tracker.
-
-        Args:
-            settings: Tracker settings. If None, the defaults are used.
-            panel_m: Panel width and height, which determine the weight of depth errors.
-            in_front_m: Both eyes must have a larger x than this, in frame `stack`.
+        """Create a tracker of eyes with x > `in_front_m`; the panels' width and height determine the weight of depth
+        errors.
         """
         self.settings = settings or TrackerSettings()
         self._panel_m, self._in_front_m = panel_m, in_front_m
@@ -172,18 +163,11 @@ class Tracker:
         self._asked_ns = 0  # latest display time that `at` has predicted eyes for
 
     def update(self, points: EyePoints | None, *, capture_ns: int) -> str:
-        """Add a sample.
+        """Add a sample in `stack`, None if there was no face. Return why it was refused, or an empty string.
 
         A sample is refused if it is not newer than the previous one, is uncertain (as in a blink), is implausible for a
         person or is away from the viewer. If two samples in a row are at a position that the viewer could have reached,
         the second one is accepted. Another person's samples are accepted only after the viewer has left.
-
-        Args:
-            points: Eyes in frame `stack`, or None if the sensor saw no face.
-            capture_ns: The sample's capture time.
-
-        Returns:
-            Why the sample was refused, or an empty string if it was accepted.
         """
         if capture_ns <= self._newest_ns:
             if self._newest_ns - capture_ns < CLOCK_RESET_NS:
@@ -210,9 +194,8 @@ class Tracker:
         self._newest_ns, self._asked_ns = -1, 0
 
     def _noise(self, points: EyePoints) -> F64:
-        """Return the (3, 3) covariance of the eyes' midpoint, in m².
-
-        If the driver reports a covariance, it is raised to a minimum. Otherwise, the noise in the settings is used.
+        """Return the (3, 3) covariance of the eyes' midpoint, in m²: the driver's, raised to a minimum, or the
+        settings'.
         """
         if points.covariance_m2 is not None and np.isfinite(points.covariance_m2).all():
             noise: F64 = (points.covariance_m2 + points.covariance_m2.T) / 2
@@ -272,11 +255,7 @@ class Tracker:
         return ""
 
     def _follow(self, head: _Head, *, is_return: bool = False) -> None:
-        """Make `head` the viewer's head.
-
-        Args:
-            is_return: True if the eyes were lost or have jumped, so that the position blends from the last one shown.
-        """
+        """Make `head` the viewer's; after a loss or a jump, the position blends from the last one shown."""
         jump_m, jump_ns = (self._history[-1].jump_m, self._history[-1].jump_ns) if self._history else (NO_JUMP, 0)
         if is_return:
             jump_ns = max(self._asked_ns, head.capture_ns)
@@ -288,17 +267,14 @@ class Tracker:
             self._other = None
 
     def ahead(self, time_ns: int) -> EyesEstimate:
-        """Return the same estimate as `at`, for a time when no picture is shown.
-
-        Later blends start from the last shown position, which this call leaves unchanged.
-        """
+        """Return the same estimate as `at`, for a time without a picture: later blends start as without this call."""
         asked_ns = self._asked_ns
         estimate = self.at(time_ns)
         self._asked_ns = asked_ns
         return estimate
 
     def at(self, time_ns: int) -> EyesEstimate:
-        """Return the eyes at a display time.
+        """Return the eyes at a display time on the samples' clock.
 
         The estimate's label is
 
@@ -307,9 +283,6 @@ class Tracker:
         * `predicted` up to `HORIZON_S` after the newest sample,
         * `held` once the face is lost and the predicted eyes slow to rest,
         * `none` if the eyes were never seen, were lost for longer than `hold_s` or were forgotten.
-
-        Args:
-            time_ns: Display time, on the samples' clock.
         """
         if not self._history or time_ns < self._history[0].head.capture_ns:
             return EyesEstimate(time_ns, 0, None, "none")
@@ -353,10 +326,7 @@ class Tracker:
 
 
 def _exceeds(covariance: F64, variance: float) -> bool:
-    """Return True if a (3, 3) covariance has a larger variance than the given one in every direction.
-
-    By Sylvester's criterion, it has if the leading minors of the difference are positive.
-    """
+    """Return True if a (3, 3) covariance has more than a variance in every direction, by Sylvester's criterion."""
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = covariance.tolist()
     xx, yy, zz = xx - variance, yy - variance, zz - variance
     minor = xx * yy - xy * xy
@@ -368,12 +338,7 @@ def sideways_sigma_m(error_m2: F64, eye_m: F64, *, panel_m: tuple[float, float])
 
     If an eye is nearer than its estimated distance x by d, the effect on a point on the display is that of a sideways
     displacement of d·u/x, where u is the distance from the point to the foot of the perpendicular from the eye to the
-    display. The result is the root mean square over the display.
-
-    Args:
-        error_m2: (3, 3) covariance of the position error, in m².
-        eye_m: (3,) position of the eyes' midpoint in frame `stack`.
-        panel_m: Panel width and height.
+    display. The result is the root mean square over the display. `error_m2` (3, 3) belongs to the eyes' midpoint.
     """
     x, y, z = eye_m.tolist()
     x = max(x, NEAREST_M)

@@ -26,20 +26,12 @@ class PanelSink(ABC):
 
     @abstractmethod
     def present(self, frame: PanelFrame, *, unchanged: bool = False, due_ns: int | None = None) -> PresentReport:
-        """Show a frame on every panel.
+        """Show a frame on every panel: the solution, aligned, and then mixed with the flat picture.
 
-        The output aligns the solution and then mixes it with the flat picture. The caller must not change the frame's
-        arrays until it has presented another frame, because the output may still be reading them.
-
-        Args:
-            unchanged: True if the frame is certain to show the same picture as the previous one. A panel that is
-                already showing this picture then skips the update, so displaying the flat picture with no viewer
-                present costs almost nothing.
-            due_ns: When the panels should show the frame, on the run's clock. An output without vertical blanks waits
-                until then if it has drawn the frame earlier.
-
-        Raises:
-            PanelLost: A panel can no longer show frames. Later calls try to reopen the panels.
+        The output may read the frame's arrays until it has presented another frame. A frame that is `unchanged`,
+        certain to show the same picture, is skipped by a panel that shows it already. An output without vertical blanks
+        waits until `due_ns` on the run's clock. Raises PanelLost if a panel can no longer show frames; later calls try
+        to reopen them.
         """
 
     @abstractmethod

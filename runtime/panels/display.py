@@ -29,19 +29,14 @@ glfw.ERROR_REPORTING = "exception"
 
 @cache
 def gl_function(name: str) -> int:
-    """Return an OpenGL function's address, or 0 if there is no such function.
-
-    The address is the same in all contexts. It is cached because moderngl keeps references to all functions, which
-    would otherwise take 20 KiB per context.
+    """Return an OpenGL function's address, the same in all contexts, or 0. It is cached because moderngl keeps
+    references to all functions, which take 20 KiB per context.
     """
     return int(glfw.get_proc_address(name) or 0)
 
 
 class WindowContext:
-    """Gives moderngl access to a GLFW window's GL context.
-
-    moderngl uses this adapter to load OpenGL functions and to make the context current.
-    """
+    """A GLFW window's GL context, from which moderngl loads functions and which it makes current."""
 
     def __init__(self, window: Any) -> None:
         self._window = window
@@ -86,14 +81,9 @@ watch: xlib.ServerWatch | None = None  # watches this process's connection to th
 
 
 def _connect() -> None:
-    """Connect GLFW to the X server until the process ends.
-
+    """Connect GLFW to the X server until the process ends. Raises PanelLost without one, and MissingPart without X11.
     The connection is kept open because, after the panels have lost their contexts, another thread may still be using a
     context of the same EGL display. If GLFW closed the EGL display, Mesa would access freed memory.
-
-    Raises:
-        PanelLost: No X server can be reached.
-        MissingPart: GLFW does not use X11.
     """
     global watch
     if watch is not None:
@@ -112,19 +102,12 @@ def _connect() -> None:
 
 
 class Display:
-    """Opens and closes windows on the X server, and lists the monitors.
-
-    A hidden root window owns the GL objects shared by all other windows. If the X server dies, the process ends (see
-    `xlib.take_over_errors`).
+    """Opens and closes windows on the X server, and lists the monitors. A hidden root window owns the GL objects shared
+    by all other windows. If the X server dies, the process ends (see `xlib.take_over_errors`).
     """
 
     def __init__(self) -> None:
-        """Connect to the X server.
-
-        Raises:
-            PanelLost: No X server can be reached.
-            MissingPart: GLFW does not use X11, for example because an X11 library is missing.
-        """
+        """Connect to the X server. Raises PanelLost without one, and MissingPart if an X11 library is missing."""
         self.faults: list[str] = []
         self._windows: list[Window] = []
         self._outputs: dict[str, int] = {}
@@ -133,13 +116,7 @@ class Display:
 
     @property
     def root(self) -> Window:
-        """The hidden root window.
-
-        Created on first use, because listing monitors does not require OpenGL.
-
-        Raises:
-            PanelLost: The X server does not support OpenGL.
-        """
+        """The hidden root window, created on first use. Raises PanelLost if the X server does not support OpenGL."""
         if not self._windows:
             _hints()
             glfw.window_hint(glfw.VISIBLE, False)
@@ -154,13 +131,8 @@ class Display:
         return in_order([monitor for monitor, _ in self._pairs()])
 
     def fullscreen_window(self, monitor: Monitor, *, title: str, opengl: bool = True) -> Window:
-        """Open a borderless window that fills a monitor, and make its context current, if it has one.
-
-        Args:
-            opengl: True to create a context that shares objects with the root window's.
-
-        Raises:
-            PanelLost: The monitor is no longer connected, or the X server does not support OpenGL.
+        """Open a borderless window that fills a monitor; with `opengl`, make its context, shared with the root's,
+        current. Raises PanelLost if the monitor is no longer connected, or the X server does not support OpenGL.
         """
         share = self.root.handle if opengl else None
         handles = {connected.connector: handle for connected, handle in self._pairs()}
@@ -216,20 +188,12 @@ class Display:
         return window
 
     def output_state(self, connector: str) -> xlib.OutputState | None:
-        """Return an output's mode and monitor, or None if the output is off or disconnected.
-
-        Args:
-            connector: The output's name, such as `DP-1`.
-        """
+        """Return the mode and monitor of an output such as `DP-1`, or None if it is off or disconnected."""
         output = self._outputs.get(connector)
         return xlib.output_state(x_display(), output) if output else None
 
     def window_state(self, window: Window) -> tuple[bool, Rectangle] | None:
-        """Return a window's state, or None if another program has destroyed it.
-
-        Returns:
-            A tuple: whether the window is mapped, and the region of the X screen that it covers.
-        """
+        """Return whether a window is mapped, and its region of the X screen, or None if it was destroyed."""
         refused = xlib.refusals()
         place = Rectangle(*glfw.get_window_pos(window.handle), *glfw.get_window_size(window.handle))
         is_viewable = bool(glfw.get_window_attrib(window.handle, glfw.VISIBLE))
@@ -277,12 +241,7 @@ def x_display() -> int:
 
 
 def connected_monitors() -> tuple[Monitor, ...]:
-    """Return the active monitors, sorted from left to right.
-
-    Raises:
-        PanelLost: No X server can be reached, or no monitor is active.
-        MissingPart: GLFW does not use X11.
-    """
+    """Return the active monitors, from left to right. Raises PanelLost without any, and MissingPart without X11."""
     display = Display()
     try:
         monitors = display.monitors()

@@ -51,19 +51,11 @@ class PanelWindows(ABC):
 
     @abstractmethod
     def draw(self, frame: PanelFrame) -> None:
-        """Draw a frame for all panels, without showing it.
-
-        Raises:
-            WindowContextLost: An OpenGL context failed.
-        """
+        """Draw a frame for all panels, without showing it. Raises WindowContextLost if an OpenGL context failed."""
 
     @abstractmethod
     def show(self, clock: Clock) -> tuple[int, int]:
-        """Show the frame on all panels, one right after another.
-
-        Returns:
-            When the first and the last panel show the frame, on `clock`.
-        """
+        """Show the frame on all panels; return when the first and the last one show it, on `clock`."""
 
     @abstractmethod
     def release(self) -> None:
@@ -80,10 +72,7 @@ class ShaderWindows(PanelWindows):
     opengl = True
 
     def __init__(self, display: Display, monitors: Sequence[Monitor], mounts: Sequence[Mount]) -> None:
-        """Open the windows.
-
-        Raises PanelLost if a monitor is no longer connected, or the X server does not support OpenGL.
-        """
+        """Open the windows. Raises PanelLost if a monitor is no longer connected, or X does not support OpenGL."""
         super().__init__()
         self._display = display
         display.root.make_current()
@@ -137,10 +126,7 @@ class ShaderWindows(PanelWindows):
 
 
 class ProcessorWindows(PanelWindows):
-    """Windows drawn by the processor, into memory shared with the X server.
-
-    Frames appear while the monitors refresh, because X does not report vertical blanks.
-    """
+    """Windows drawn by the processor, into memory shared with X, which does not report vertical blanks."""
 
     opengl = False
 
@@ -152,12 +138,7 @@ class ProcessorWindows(PanelWindows):
         mountings: Sequence[Mounting],
         clock: Clock,
     ) -> None:
-        """Open the windows.
-
-        Raises:
-            NotShared: The X server cannot reach this process's memory.
-            PanelLost: A monitor is no longer connected.
-        """
+        """Open the windows. Raises PanelLost without a monitor, NotShared if X cannot reach this process's memory."""
         super().__init__()
         self._pictures: list[SharedPicture] = []
         self._changed: dict[int, PixelRect] = {}  # changed parts of the pictures
@@ -232,15 +213,9 @@ def open_windows(
     clock: Clock,
     on_processor: bool | None = None,
 ) -> PanelWindows:
-    """Open a fullscreen window for each panel.
-
-    Args:
-        on_processor: True to draw on the processor if that is possible, False to draw by OpenGL, or None to draw on the
-            processor if OpenGL would too.
-
-    Raises:
-        InputError: A grey curve's file cannot be read or is invalid.
-        PanelLost: A monitor is no longer connected, or the X server does not support OpenGL.
+    """Open a fullscreen window for each panel. `on_processor` draws there if possible, or if None where OpenGL would
+    too. Raises InputError for an invalid grey curve, and PanelLost if a monitor is no longer connected or the X server
+    does not support OpenGL.
     """
     mounts = [
         mount_of(panel, screen_px=monitor.size_px, layer_px=layer_px)

@@ -75,15 +75,9 @@ def in_order(monitors: Sequence[Monitor]) -> tuple[Monitor, ...]:
 
 
 def bind(panels: Sequence[PanelSettings], monitors: Sequence[Monitor]) -> tuple[Monitor, ...]:
-    """Find each panel's monitor.
-
-    If a panel's settings give both a serial number and a connector, the monitor must match both. The connector is
-    needed if several monitors have the same serial number.
-
-    Raises:
-        InputError: A panel's settings give neither a serial number nor a connector.
-        PanelLost: A panel's monitor is missing, ambiguous, already assigned or mirrored on another panel's. This may
-            be temporary.
+    """Find each panel's monitor by serial number, by connector, or by both if several have the same number. Raises
+    InputError if a panel's settings give neither, and PanelLost if a monitor is missing, ambiguous, already assigned or
+    mirrored on another panel's, which may be temporary.
     """
     ordered = in_order(monitors)
     bound: list[Monitor] = []
@@ -125,10 +119,7 @@ def _find(number: int, panel: PanelSettings, monitors: tuple[Monitor, ...]) -> M
 
 
 def check_modes(panels: Sequence[PanelSettings], monitors: Sequence[Monitor], *, width_px: int, height_px: int) -> None:
-    """Raise PanelLost if any monitor's resolution differs from the stack's.
-
-    Rescaling would mix the phases of neighbouring pixels and so ruin both eyes' pictures.
-    """
+    """Raise PanelLost if any monitor's resolution differs from the stack's: rescaling would mix neighbouring phases."""
     for number, (panel, monitor) in enumerate(zip(panels, monitors, strict=True)):
         columns, rows = panel_size_px(
             screen_width_px=monitor.width_px, screen_height_px=monitor.height_px, rotation_deg=panel.rotation_deg

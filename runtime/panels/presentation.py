@@ -148,11 +148,7 @@ class FrameTextures:
         self._flat_version: int | None = None
 
     def lacks(self, frame: PanelFrame) -> tuple[bool, bool]:
-        """Check which of a frame's pictures must be uploaded before the frame can be drawn.
-
-        Returns:
-            Two flags, for the solution and for the flat picture: True if it is visible, but has not been uploaded.
-        """
+        """Return whether the solution and the flat picture are visible but not uploaded."""
         flatness = flatness_of(frame)
         return (
             flatness < 1.0 and frame.solved_version != self._solved_version,
@@ -198,10 +194,7 @@ class FrameTextures:
         return self._reliefs[key]
 
     def _written(self, kind: str, layers: U8) -> tuple[moderngl.Texture, ...]:
-        """Write layers to textures, one for each panel, and return the textures.
-
-        The first time that layers of a given size are written, the textures are created.
-        """
+        """Write layers to textures, one for each panel, which are created for each new size."""
         key = kind, (layers.shape[2], layers.shape[1])
         if key not in self._textures:
             self._textures[key] = tuple(self._context.texture(key[1], 4) for _ in range(self.count))
@@ -214,16 +207,7 @@ class FrameTextures:
 
 
 def mount_of(settings: PanelSettings, *, screen_px: tuple[int, int], layer_px: tuple[int, int]) -> Mount:
-    """Return how a monitor shows its layer.
-
-    Args:
-        screen_px: The monitor's width and height.
-        layer_px: Width and height of each of the stack's panels.
-
-    Raises:
-        InputError: The grey curve's file cannot be read or is invalid.
-        ValueError: The homography is singular or not finite.
-    """
+    """Return how a monitor shows its layer. Raises InputError for its grey curve, ValueError for its homography."""
     matrix = layer_from_screen(
         screen_width_px=screen_px[0],
         screen_height_px=screen_px[1],
@@ -241,10 +225,7 @@ def mount_of(settings: PanelSettings, *, screen_px: tuple[int, int], layer_px: t
 
 
 class Painter:
-    """Draws one panel's records using the presentation shader.
-
-    Each window needs its own painter, because vertex arrays cannot be shared between GL contexts.
-    """
+    """Draws one panel's records using the presentation shader, in one window: contexts do not share vertex arrays."""
 
     def __init__(self, context: moderngl.Context, mount: Mount) -> None:
         """Compile the shader for one monitor, in its window's context."""

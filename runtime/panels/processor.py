@@ -49,10 +49,8 @@ class Axis(NamedTuple):
     offset_px: float
 
     def turned(self, line: Line, size_px: tuple[int, int]) -> Line:
-        """Turn a map from layer to picture pixels into one from monitor pixels to the turned picture's.
-
-        Args:
-            size_px: The picture's width and height, as seen by the viewer.
+        """Turn a map from layer to picture pixels into one from monitor to turned picture's, `size_px` as seen by the
+        viewer.
         """
         scale, shift = line
         edge = 0.0 if self.sign > 0 else float(size_px[self.layer_axis])
@@ -70,11 +68,7 @@ class Mounting(NamedTuple):
 
     @classmethod
     def of(cls, settings: PanelSettings, *, screen_px: tuple[int, int], layer_px: tuple[int, int]) -> Mounting:
-        """Return a panel's mounting.
-
-        Raises:
-            ValueError: The homography is singular or not finite.
-        """
+        """Return a panel's mounting. Raises ValueError if the homography is singular or not finite."""
         mounted: dict[str, Any] = {"rotation_deg": settings.rotation_deg, "mirror": settings.mirror}
         layer_from_monitor = layer_from_screen(
             screen_width_px=screen_px[0], screen_height_px=screen_px[1],
@@ -115,10 +109,7 @@ class _Pictures:
 
 
 class _PictureMemory:
-    """Memory for a picture of any size for each panel.
-
-    It is filled when created, because memory is slow when first used, which would delay a refresh.
-    """
+    """Memory for a picture of any size for each panel, filled at once, because first use is slow."""
 
     def __init__(self, mountings: Sequence[Mounting]) -> None:
         self._rest = min(rest_code(len(mountings)), 255)
@@ -184,10 +175,8 @@ class ProcessorPainter:
         return parts
 
     def _filled_by(self, panel: int, shown: ShownPanel, solved: _Pictures | None) -> PixelRect:
-        """Return the part of a panel's picture outside which it shows the rest code.
-
-        Args:
-            solved: The solution, or None if the flat picture is shown or mixed in.
+        """Return the part of a picture outside which it shows the rest code; `solved` is None if the flat picture
+        counts.
         """
         if solved is None:
             return _whole(self._screens[panel])
@@ -221,14 +210,9 @@ class ProcessorPainter:
     def _prepared(
         self, layers: U8, memory: _PictureMemory, *, border_px: int, extended_px: Sequence[int] = ()
     ) -> tuple[tuple[U8, ...], tuple[PixelRect, ...]]:
-        """Turn layers for the monitors, and surround them with the rest code.
-
-        Args:
-            memory: Memory for the pictures, which replace those last prepared there.
-            extended_px: For each panel, the innermost pixels of the border in which the layer's edge is repeated.
-
-        Returns:
-            The pictures, and in each the box of the pixels that differ from the rest code.
+        """Turn layers for the monitors, and surround them with the rest code; return them with the boxes that differ
+        from it. They replace those last prepared in `memory`. In the innermost `extended_px` of the border, edges are
+        repeated.
         """
         turned = [mounting.on_screen(layer) for layer, mounting in zip(layers, self._mountings, strict=True)]
         pictures, boxes = memory.pictures([_size_px(layer) for layer in turned], border_px=border_px), []
@@ -282,11 +266,9 @@ class ProcessorPainter:
         return (solved.version, *maps, flat.version, draw.flatness), shown
 
     def _maps(self, panel: int, draw: PanelDraw, solved: _Pictures) -> list[tuple[float, float, float, float]]:
-        """Return a record's maps (scale_u, scale_v, shift_u, shift_v) for the turned layer's pixels.
-
-        The first leads to positions in the source. If the content's relief displaces them, two follow: to positions in
-        the relief, and to the displacement by a relief of 1. Positions count from the centre of a picture's top left
-        pixel.
+        """Return a record's maps (scale_u, scale_v, shift_u, shift_v) for the turned layer's pixels. The first leads to
+        positions in the source. If the content's relief displaces them, two follow: to positions in the relief, and to
+        the displacement by a relief of 1. Positions count from the centre of a picture's top left pixel.
         """
         along: list[list[Line]] = [[], [], []]  # for each map, across and down; plain floats, because arrays are slow
         mounting = self._mountings[panel]
@@ -330,9 +312,8 @@ def _registered(picture: U8, mounting: Mounting, mount: Mount, layer_px: tuple[i
 
 
 def _curve_table(coarse: F32) -> NDArray[np.uint32]:
-    """Return a grey curve as (3, CURVE_ENTRIES) pixels, by channel (blue, green, red) and quarters of a code.
-
-    Each pixel has only the channel's byte. The sum of one for each channel is a pixel to display.
+    """Return a curve as (3, CURVE_ENTRIES) pixels of one byte, by channel (blue, green, red) and quarters of a code.
+    The sum of one for each channel is a pixel to display.
     """
     codes = np.arange(CURVE_ENTRIES) / CURVE_STEPS
     greys = np.array([np.interp(codes, np.arange(len(coarse)), coarse[:, channel]) for channel in (2, 1, 0)])

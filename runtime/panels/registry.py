@@ -52,14 +52,8 @@ def panel_settings(settings: OutputSettings, count: int) -> tuple[PanelSettings,
 
 
 def open_panels(settings: OutputSettings, stack: PanelStack, clock: Clock, context: moderngl.Context) -> PanelSink:
-    """Open the output described by the `[output]` section of the settings.
-
-    Args:
-        context: The content's GL context. The output makes it current again at the end of each call.
-
-    Raises:
-        InputError: The settings cannot be used, for example because no monitor is named for a panel.
-        PanelLost: A monitor is missing or cannot be used. This may be temporary.
+    """Open the output that `[output]` describes. After each call, `context`, the content's, is current again. Raises
+    InputError if settings cannot be used, and PanelLost for a monitor, which may be temporary.
     """
     if settings.kind != "offscreen":
         from runtime.panels.window import WindowPanels

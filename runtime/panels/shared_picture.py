@@ -82,10 +82,9 @@ def _libraries() -> tuple[ctypes.CDLL, ctypes.CDLL, ctypes.CDLL]:
 
 @functools.cache
 def _short_calls() -> tuple[ctypes.PyDLL, ctypes.PyDLL]:
-    """Return the libraries of functions that only write to the connection.
-
-    They keep Python's global lock. Taking it again could take milliseconds, because the solver's thread, which has a
-    lower priority, may lose its processor while it has the lock.
+    """Return the libraries of functions that only write to the connection. They keep Python's global lock. Taking it
+    again could take milliseconds, because the solver's thread, which has a lower priority, may lose its processor while
+    it has the lock.
     """
     x11, extensions = ctypes.PyDLL("libX11.so.6"), ctypes.PyDLL("libXext.so.6")
     x11.XFlush.argtypes = [c_void_p]
@@ -99,13 +98,8 @@ class SharedPicture:
     """A picture that fills a window."""
 
     def __init__(self, display: int, window: int, *, width_px: int, height_px: int) -> None:
-        """Create a black picture.
-
-        Args:
-            window: The window's identifier. The window must have the screen's default visual.
-
-        Raises:
-            NotShared: Memory cannot be shared with the X server, or its pixels are not 32-bit BGRX.
+        """Create a black picture for a window with the default visual. Raises NotShared if memory cannot be shared with
+        the X server, or its pixels are not 32-bit BGRX.
         """
         self._display, self._window = display, window
         self._segment = _Segment()
@@ -180,9 +174,8 @@ class SharedPicture:
         self.pixels[:] = 0
 
     def _pixel_read_back(self, x11: ctypes.CDLL) -> int | None:
-        """Return the value that the X server finds in the first pixel, after setting it to a random value.
-
-        A server in another IPC namespace may have attached a different segment, which has the same number there.
+        """Return the first pixel as the X server finds it, after setting it to a random value. A server in another IPC
+        namespace may have attached a different segment, which has the same number there.
         """
         depth = self._image.contents.depth
         ctypes.c_uint32.from_address(self._image.contents.data).value = int.from_bytes(os.urandom(3), "little")

@@ -20,11 +20,9 @@ REFRESH_TOLERANCE = 1e-3  # relative tolerance when comparing refresh rates
 
 
 class PlacementWatch:
-    """Detects when a window or monitor changes.
-
-    Each call to `look` checks at most one window or monitor, so that each of them is checked once every `EVERY_NS`. But
-    if the X server has refused a request since the last call, a window or monitor has disappeared, and all of them are
-    checked in the same call.
+    """Detects when a window or monitor changes. Each call to `look` checks at most one window or monitor, so that each
+    of them is checked once every `EVERY_NS`. But if the X server has refused a request since the last call, a window or
+    monitor has disappeared, and all of them are checked in the same call.
     """
 
     def __init__(self, display: Display, monitors: Sequence[Monitor], windows: Sequence[Window], clock: Clock) -> None:
@@ -42,11 +40,7 @@ class PlacementWatch:
         self._refusals = xlib.refusals()
 
     def look(self) -> str:
-        """Check a window or monitor if one is due.
-
-        Returns:
-            Any faults found, each with the panel number, or an empty string.
-        """
+        """Check a window or monitor if due; return the faults, each with its panel, or an empty string."""
         if xlib.refusals() != self._refusals:
             faults = [fault for fault in (question() for question in self._questions) if fault]
             self._refusals = xlib.refusals()  # read after the queries, because they may be refused too

@@ -31,18 +31,15 @@ class WindowPanels(PanelSink):
 
     `present` prepares a new solution once, draws it for all windows and then shows all windows one right after another.
     If anything fails before the first is shown, the old frame stays on all panels. With OpenGL, only the first window
-    waits for its vertical blank, because with N windows waiting, the refresh rate would be divided by N. `skew_ms` is
-    the time from when the first panel is shown until the last one is. It does not include phase differences between the
-    monitors' vertical blanks.
+    waits for its vertical blank, because with N windows waiting, the refresh rate would be divided by N. `skew_ms`, the
+    time from the first panel to the last, does not include phase differences between monitors' blanks.
 
-    Once per second, each window and monitor is compared with its initial state. A refresh makes at most one query,
-    which takes about 0.1 ms. If a monitor, window or context has changed or is lost, all windows are closed and
-    `present` raises PanelLost. Later calls to `present` reopen the windows after half a second, or as soon as X reports
-    that monitors have changed. The hidden window keeps the shared context, unless that is lost too. If the X server
-    dies, the process ends with exit status 75 and must be restarted.
+    Once per second, each window and monitor is compared with its initial state, by at most one query of 0.1 ms in a
+    refresh. If a monitor, window or context has changed or is lost, all windows are closed and `present` raises
+    PanelLost. Later calls reopen them after half a second, or as soon as X reports that monitors have changed. If the X
+    server dies, the process ends with exit status 75 and must be restarted.
 
-    All methods must be called on the main thread, because GLFW requires it. After each call, the `content` context is
-    current again.
+    GLFW requires that all methods are called on the main thread. After each, the `content` context is current again.
     """
 
     name = "windows"
@@ -51,18 +48,9 @@ class WindowPanels(PanelSink):
         self, panels: tuple[PanelSettings, ...], stack: PanelStack, clock: Clock, content: moderngl.Context, *,
         any_shape: bool = False, on_processor: bool | None = None,
     ) -> None:  # fmt: skip
-        """Open a window for each panel.
-
-        Args:
-            any_shape: True to accept monitors whose resolution differs from the stack's and to fill them, for
-                `identify`.
-            on_processor: True to draw on the processor if that is possible, False to draw by OpenGL, or None to draw on
-                the processor if there is no GPU.
-
-        Raises:
-            InputError: No monitor is named for a panel, or its settings are invalid.
-            PanelLost: The X server or a monitor is missing or cannot be used. This may be temporary.
-            MissingPart: GLFW does not use X11.
+        """Open a window for each panel, on monitors of any resolution (for `identify`) if `any_shape`. `on_processor`
+        is that of `open_windows`. Raises InputError for the panels' settings, PanelLost for X or a monitor, which may
+        be temporary, and MissingPart if GLFW does not use X11.
         """
         self._any_shape, self._on_processor = any_shape, on_processor
         self._panels, self._stack = panels, stack
@@ -85,10 +73,7 @@ class WindowPanels(PanelSink):
 
     @property
     def period_ns(self) -> int | None:
-        """Refresh period of the first panel's monitor, or None if unknown.
-
-        The swaps are paced by this monitor's vertical blanks.
-        """
+        """Refresh period of the first panel's monitor, whose blanks pace the swaps, or None if unknown."""
         refresh_hz = self.monitors[0].refresh_hz if self.monitors else 0.0
         return round(NS_PER_S / refresh_hz) if refresh_hz else None
 
@@ -97,11 +82,7 @@ class WindowPanels(PanelSink):
         return [window.handle for window in self._windows.windows] if self._windows is not None else []
 
     def present(self, frame: PanelFrame, *, unchanged: bool = False, due_ns: int | None = None) -> PresentReport:
-        """Show a frame on all panels, unless it is unchanged and still on them.
-
-        Raises:
-            PanelLost: A window, monitor or context has changed or is lost.
-        """
+        """Show a frame on all panels, unless it is still on them. Raises PanelLost if anything has changed."""
         if self._windows is None and not self._may_try():
             raise PanelLost(self._lost)
         try:
@@ -219,14 +200,8 @@ class WindowPanels(PanelSink):
 
 
 def every_monitor() -> tuple[WindowPanels, list[U8], tuple[Monitor, ...]]:
-    """Open a window on every monitor, and draw a test card for each.
-
-    Returns:
-        The open windows, their test cards and their monitors.
-
-    Raises:
-        PanelLost: There is no X server or no active monitor, or a window cannot be opened.
-        MissingPart: GLFW does not use X11, or EGL does not offer OpenGL 3.3.
+    """Open a window on every monitor, and return them, a test card for each, and the monitors. Raises PanelLost without
+    X, monitors or windows, and MissingPart without GLFW on X11 or OpenGL 3.3 by EGL.
     """
     monitors = connected_monitors()
     width, height = max(m.width_px for m in monitors), max(m.height_px for m in monitors)

@@ -119,10 +119,7 @@ _refused = 0  # number of refused requests
 
 
 def refusals() -> int:
-    """Return how many requests the X server has refused.
-
-    If this number grows, a window or monitor has disappeared.
-    """
+    """Return how many requests X has refused; if it grows, a window or monitor has disappeared."""
     return _refused
 
 
@@ -146,11 +143,9 @@ _IO_ERROR_HANDLER = IOErrorHandler(_end)
 
 
 def take_over_errors() -> None:
-    """Install handlers for X errors.
-
-    If the X server refuses a request, for example because a monitor has been unplugged, this is only logged and
-    counted. If the X server dies, the process logs a message and ends immediately, because Xlib, EGL and GLFW would
-    hang or crash even when asked to release objects.
+    """Install handlers for X errors. If the X server refuses a request, for example because a monitor has been
+    unplugged, this is only logged and counted. If the X server dies, the process logs a message and ends immediately,
+    because Xlib, EGL and GLFW would hang or crash even when asked to release objects.
     """
     x11 = _libraries()[0]
     x11.XSetErrorHandler(_ERROR_HANDLER)
@@ -158,18 +153,12 @@ def take_over_errors() -> None:
 
 
 class ServerWatch:
-    """Ends the process if the X server dies while the main thread is stuck in a call.
-
-    Without this, if the connection broke during a buffer swap, Mesa's software renderer would loop endlessly, and Xlib
-    would not notice.
+    """Ends the process if the X server dies while the main thread is stuck in a call. Without this, if the connection
+    broke during a buffer swap, Mesa's software renderer would loop endlessly, and Xlib would not notice.
     """
 
     def __init__(self, display: int) -> None:
-        """Start watching a connection on a new thread.
-
-        Args:
-            display: Pointer to an open Xlib `Display`. Call `stop` before closing it.
-        """
+        """Watch a connection, given its open Xlib `Display`, on a new thread. Call `stop` before closing it."""
         x11 = _libraries()[0]
         x11.XConnectionNumber.argtypes = [c_void_p]
         self._connection: int = x11.XConnectionNumber(display)
@@ -194,10 +183,7 @@ class ServerWatch:
 
 
 def output_state(display: int, output: int) -> OutputState | None:
-    """Return an output's state, or None if the output is off or disconnected.
-
-    This takes four round trips to the X server.
-    """
+    """Return an output's state, by four round trips, or None if it is off or disconnected."""
     x11, randr = _libraries()
     resources = randr.XRRGetScreenResourcesCurrent(display, x11.XDefaultRootWindow(display))
     if not resources:
