@@ -55,12 +55,7 @@ class Bundle:
     photograph: Any  # (K,) index of the photograph that shows each point
 
     def sigma_of(self, derived: Any) -> F64:
-        """Return the first-order standard deviation of a quantity computed from the panels.
-
-        Args:
-            derived: Function that maps a sequence of panels to an array. The standard deviations have the array's
-                shape.
-        """
+        """Return the first-order standard deviation of an array that `derived` computes from a sequence of panels."""
         columns = []
         for number, step in enumerate(np.sqrt(np.diag(self.covariance)) * 0.1):
             up, down = (np.asarray(derived(self._stepped(number, signed))) for signed in (step, -step))
@@ -95,10 +90,8 @@ class _State:
 
 
 class _Problem:
-    """Least-squares problem: the detected points, their residuals and the derivatives.
-
-    A step is a vector of changes: first to the lens, then to the poses of all panels except the reference, and last to
-    the camera's poses.
+    """Least-squares problem: the detected points, their residuals and the derivatives. A step is a vector of changes:
+    first to the lens, then to the poses of all panels except the reference, and last to the camera's poses.
     """
 
     def __init__(self, seen: Sequence[SeenMarks], stack: PanelStack, *, reference: int) -> None:
@@ -132,9 +125,8 @@ class _Problem:
         return np.asarray(seen.reshape(-1, 2) - self.image_px, dtype=np.float64)
 
     def residuals(self, state: _State) -> F64:
-        """Return a vector (2K + priors,) with `residual_px` and the lens's deviations from its prior.
-
-        The deviations from the prior are given in standard deviations.
+        """Return a vector (2K + priors,) of `residual_px` and the lens's deviations from its prior, in standard
+        deviations.
         """
         lens = state.lens
         prior = np.concatenate([[lens[0] - lens[1]], lens[2:4] - self.middle, lens[4:]]) * self.prior_scale
@@ -172,11 +164,7 @@ class _Problem:
         return _State(state.lens + step[:LENS], turns, middles_m, change @ state.poses)
 
     def start(self, *, reverse: bool = False) -> _State:
-        """Return the initial state: ideal panels, and the best of several focal lengths and its camera poses.
-
-        Args:
-            reverse: Assume that the panels are in reverse order.
-        """
+        """Return ideal panels, maybe in reverse order, and the best of several focal lengths with its camera poses."""
         count, origin_m = self.stack.count, self.stack.x_m[self.reference]
         middles_m = np.zeros((count, 3))
         middles_m[:, 0] = origin_m + (np.array(self.stack.x_m) - origin_m) * (-1 if reverse else 1)
@@ -198,11 +186,8 @@ class _Problem:
 
 
 def _solved(problem: _Problem, state: _State, used: NDArray[np.bool_], *, robust: bool) -> _State:
-    """Minimise the residuals of the `used` points with the Levenberg-Marquardt method.
-
-    Args:
-        used: Mask (K,) of the points to fit.
-        robust: Minimise the soft L1 norm, by iterative reweighting, rather than the sum of squares.
+    """Minimise the residuals of the points in the mask `used` (K,) with the Levenberg-Marquardt method. `robust`
+    minimises the soft L1 norm, by iterative reweighting, rather than the sum of squares.
     """
     kept = np.concatenate([np.repeat(used, 2), np.ones(len(problem.prior_scale), bool)])
 
@@ -254,15 +239,9 @@ def _median_px(problem: _Problem, state: _State) -> float:
 
 
 def adjust(seen: Sequence[SeenMarks], stack: PanelStack, *, reference: int) -> Bundle:
-    """Estimate every panel's pose from photographs of the boards.
-
-    Args:
-        seen: Saddle points found in each photograph. All photographs must have the same size and come from one camera.
-        stack: Configured geometry, used as the starting point of the fit.
-        reference: Index of the panel that defines the `stack` frame.
-
-    Raises:
-        Undetermined: The panels are in reverse order, or the photographs are too few or too similar.
+    """Estimate every panel's pose from one camera's photographs of the boards, starting from the configured geometry.
+    `reference` is the panel that defines frame `stack`. Raises Undetermined if the panels are in reverse order, or the
+    photographs are too few or too similar.
     """
     problem = _Problem(seen, stack, reference=reference)
     used = np.ones(len(problem.image_px), bool)
@@ -297,9 +276,8 @@ def adjust(seen: Sequence[SeenMarks], stack: PanelStack, *, reference: int) -> B
 
 
 def _covariance(problem: _Problem, state: _State, used: NDArray[np.bool_], *, sigma: float) -> F64:
-    """Return the covariance of all unknowns, for points with a standard deviation of `sigma` pixels.
-
-    Raises Undetermined if the photographs do not determine all unknowns.
+    """Return the covariance of all unknowns, for points with a standard deviation of `sigma` pixels. Raises
+    Undetermined if the photographs do not determine all unknowns.
     """
     slopes = problem.slopes(state)
     slopes[: 2 * len(used)] /= sigma

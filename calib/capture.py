@@ -1,7 +1,4 @@
-"""Guide the user through the calibration viewpoints and store a pair of points for each.
-
-Used by the `phasestack calibrate capture` command.
-"""
+"""Guide the user through the calibration viewpoints and store a pair of points for each (`calibrate capture`)."""
 
 from __future__ import annotations
 
@@ -47,10 +44,7 @@ class EyeWindow:
         self._samples: deque[tuple[int, F64]] = deque()  # capture time and midpoint between the eyes
 
     def add(self, capture_ns: int, eyes: EyePoints | None) -> None:
-        """Add a sample in the sensor frame, and drop any that are more than half a second old.
-
-        The midpoint is ignored unless both eyes were measured with confidence.
-        """
+        """Add a sample in the sensor frame, unless an eye is uncertain, and drop any more than half a second old."""
         middle = midpoint(eyes)
         if middle is not None:
             self._samples.append((capture_ns, middle))
@@ -58,9 +52,8 @@ class EyeWindow:
             self._samples.popleft()
 
     def measure(self) -> tuple[F64, float] | None:
-        """Return the median position (3,) in the sensor frame and the scatter around it, both in metres.
-
-        The scatter is a robust estimate of the RMS distance from the median. Returns None if there are too few samples.
+        """Return the median position (3,) in the sensor frame and the RMS scatter around it, in metres, or None if too
+        few.
         """
         if len(self._samples) < MIN_SAMPLES:
             return None
@@ -71,9 +64,8 @@ class EyeWindow:
 
 
 class Walk:
-    """Guide for a user who moves from viewpoint to viewpoint and accepts a pair of points at each.
-
-    The caller supplies the sensor samples and key presses. The class itself uses neither a clock nor threads.
+    """Guide for a user who moves from viewpoint to viewpoint and accepts a pair of points at each. The caller supplies
+    samples and key presses; there are no clock and no threads here.
     """
 
     def __init__(
@@ -84,12 +76,8 @@ class Walk:
         say: Callable[[str], None],
         chart: Callable[[Viewpoint], None] | None = None,
     ) -> None:
-        """Start with the first viewpoint that has no pair yet.
-
-        Args:
-            file: File that stores the accepted pairs.
-            viewpoints: Viewpoints, in the order they are to be visited.
-            chart: Function that shows a viewpoint's chart, or None if the charts are shown by other means.
+        """Start with the first viewpoint, in order, that has no pair in `file` yet. `chart` shows a viewpoint's chart,
+        if given.
         """
         self._file, self._say, self._chart = file, say, chart
         self._left = [v for v in viewpoints if v.name not in file.viewpoints]
@@ -184,16 +172,9 @@ class Walk:
 def capture_live(
     out: Path, settings: Settings, hardware: SetupHardware, *, show: bool, say: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Guide the user through the viewpoints in front of the display.
-
-    Args:
-        out: CSV file for the pairs. If it exists, pairs are added to it.
-        hardware: Real or simulated hardware.
-        show: Show the charts on the panels.
-
-    Raises:
-        InputError: The file is invalid or cannot be written, or the sensor or the panels cannot be opened.
-        FatalError: The sensor failed permanently.
+    """Guide the user through the viewpoints in front of the display, and add pairs to the CSV file `out`. `show` puts
+    the charts on the panels. Raises InputError for the file, the sensor or the panels, and FatalError if the sensor
+    failed permanently.
     """
     file = PairsFile(out)
     say(f"sensor: {hardware.open_sensor(settings)}")
@@ -214,14 +195,8 @@ def capture_live(
 
 
 def capture_recording(out: Path, settings: Settings, *, source: str) -> dict[str, Any]:
-    """Write a pair for every sample in a recording that includes the true eye positions.
-
-    Args:
-        out: CSV file for the pairs. If it exists, pairs are added to it.
-        source: Path of the recording, or `demo` for the built-in recording.
-
-    Raises:
-        InputError: No sample has both the true eye positions and confidently measured eyes.
+    """Write a pair for every sample in a recording, or `demo`, that includes the true eye positions, to the CSV file
+    `out`. Raises InputError if no sample has both the true eye positions and confidently measured eyes.
     """
     chosen = settings.sensor.model_copy(update={"driver": "replay", "source": source, "loop": False})
     samples = RecordedSamples(open_sensor(chosen, SimulatedClock()))

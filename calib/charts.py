@@ -28,10 +28,8 @@ WIDEST_FOV_DEG = 40.0  # horizontal field of view of the eyes' images, as in the
 
 
 def chart_fov_deg(viewpoint: Viewpoint, stack: PanelStack) -> float:
-    """Return the horizontal field of view of the eyes' images at a viewpoint, in degrees.
-
-    This is the published 40 degrees, or the angle that the display fills if that is smaller, so the lines are on the
-    panels at any distance.
+    """Return the horizontal field of view of the eyes' images at a viewpoint, in degrees. This is the published 40
+    degrees, or the angle that the display fills if that is smaller, so the lines are on the panels at any distance.
     """
     return min(WIDEST_FOV_DEG, float(np.degrees(2 * np.arctan(stack.width_m / 2 / (viewpoint.radius_cm / 100)))))
 
@@ -53,12 +51,7 @@ class Charts:
     """Solver that computes the layers of one stack's charts."""
 
     def __init__(self, settings: Settings) -> None:
-        """Load the model that computes the layers.
-
-        Raises:
-            InputError: The model cannot be loaded for this stack.
-            MissingPart: An optional package or the compiled library is not installed.
-        """
+        """Load the model that computes the layers. Raises InputError if it does not fit the stack, or MissingPart."""
         self.stack = settings.stack.stack()
         self.ipd_m = settings.calibration.ipd_m or IPD_M
         self._predictor = load_predictor(MODEL, self.stack, settings.model)
@@ -76,15 +69,7 @@ class Charts:
 
 
 def make_charts(out: Path, viewpoints: Sequence[Viewpoint], settings: Settings) -> dict[str, Any]:
-    """Write every chart's layers as PNG files, together with `charts.json`.
-
-    Args:
-        viewpoints: Viewpoints that need a chart.
-
-    Raises:
-        InputError: A file cannot be written, or the model cannot be loaded for this stack.
-        MissingPart: An optional package or the compiled library is not installed.
-    """
+    """Write the layers of each viewpoint's chart as PNG files, and `charts.json`. Raises as `Charts`, and for files."""
     charts = []
     with OutputFolder(out) as folder, closing(Charts(settings)) as drawn:
         for viewpoint in tracked("charts", viewpoints):

@@ -25,12 +25,8 @@ KEPT_BYTES_MAX = 64 << 20  # size limit for a file that is backed up
 
 
 def save(path: Path, text: str) -> Path | None:
-    """Write a file atomically and keep the version it replaces under a numbered name.
-
-    If the path is a symbolic link, the link is kept and its target is written.
-
-    Returns:
-        The path of the old version, which has the same permissions as the file, or None if the file is new.
+    """Write a file, or a symbolic link's target, atomically, and keep the version that it replaces. Return the numbered
+    path of the old version, with the same permissions, or None if the file is new.
     """
     path, kept = path.resolve(), None
     if untrusted_input.is_there(path):
@@ -50,10 +46,7 @@ def _version(path: Path, number: int) -> Path:
 
 
 def read_document(config: Path) -> TOMLDocument:
-    """Read a configuration, or return an empty document if the file does not exist.
-
-    Raises InputError if the configuration is invalid.
-    """
+    """Read a configuration, empty if the file does not exist. Raises InputError if it is invalid."""
     if not untrusted_input.is_there(config):
         return tomlkit.document()
     load_settings(config)
@@ -64,16 +57,8 @@ def read_document(config: Path) -> TOMLDocument:
 
 
 def rewrite(config: Path, change: Callable[[TOMLDocument], None]) -> Path | None:
-    """Change a configuration file.
-
-    If the result is invalid, InputError is raised and the file stays unchanged.
-
-    Args:
-        config: Configuration file. A missing file is created.
-        change: Function that modifies the parsed document in place.
-
-    Returns:
-        The path of the old version, or None if the file is new.
+    """Change a configuration's document in place, and return the old version's path, or None for a new file. If the
+    result is invalid, InputError is raised and the file stays unchanged.
     """
     document = read_document(config)
     change(document)
@@ -91,14 +76,7 @@ def put(document: TOMLDocument, section: str, values: Mapping[str, Any]) -> None
 
 
 def put_panels(document: TOMLDocument, key: str, values: Mapping[int, Any], *, panels: int) -> None:
-    """Set a key, such as `lut`, in the `[[output.panels]]` tables. Missing tables are created.
-
-    Args:
-        document: Configuration to modify.
-        key: Key to set.
-        values: The key's values, keyed by panel index. Other panels keep their values.
-        panels: Number of panels in the stack.
-    """
+    """Set a key, such as `lut`, in `[[output.panels]]` to values by panel index. Missing tables are created."""
     output: Any = document.setdefault("output", tomlkit.table())
     if "panels" not in output:
         output["panels"] = tomlkit.aot()
@@ -109,13 +87,8 @@ def put_panels(document: TOMLDocument, key: str, values: Mapping[int, Any], *, p
 
 
 def put_monitors(document: TOMLDocument, tables: Sequence[Mapping[str, Any]]) -> None:
-    """Set every panel's monitor and mounting.
-
-    A panel whose monitor and mounting have not changed keeps its registration and its grey curve.
-
-    Args:
-        document: Configuration to modify.
-        tables: Keys and values that identify the monitor and describe its mounting, for each panel from rear to front.
+    """Set every panel's monitor and mounting, rear to front. A panel whose monitor and mounting have not changed keeps
+    its registration and its grey curve.
     """
     output: Any = document.setdefault("output", tomlkit.table())
     past = [dict(table.unwrap()) for table in output.get("panels", ())]

@@ -46,9 +46,8 @@ def _detector() -> Any:
 
 
 def _markers(picture: U8, known: dict[int, Mark]) -> list[tuple[Mark, F64]]:
-    """Return the marks that can be read in a picture, each with its marker's corners (4, 2) in pixels.
-
-    Markers that appear more than once are dropped. `known` maps the ids of all markers to their marks.
+    """Return the legible marks, each with its corners (4, 2) in pixels, except those that appear more than once.
+    `known` maps the ids of all markers to their marks.
     """
     scale = min(2.0, DETECTION_PX / max(picture.shape))
     kind = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
@@ -100,10 +99,7 @@ def find_marks(picture: U8, stack: PanelStack, *, name: str) -> SeenMarks:
 
 
 def _mirrored(picture: U8, known: dict[int, Mark], counts: list[int]) -> str:
-    """Return a message if marks can be read only in a picture's mirror image, otherwise "".
-
-    `counts` is the number of marks found on each panel.
-    """
+    """Return a message if marks, counted by panel, can be read only in a picture's mirror image, otherwise ""."""
     if min(counts) >= MIN_MARKS:
         return ""
     turned = [mark.panel for mark, _ in _markers(np.ascontiguousarray(picture[:, ::-1]), known)]
@@ -116,12 +112,8 @@ def _mirrored(picture: U8, known: dict[int, Mark], counts: list[int]) -> str:
 
 
 def _unreadable(counts: list[int], edges: list[float], unit_px: float) -> str:
-    """Return a message if the marks are missing, blurred or too small, otherwise an empty string.
-
-    Args:
-        counts: Number of marks found on each panel.
-        edges: Edge width of each mark, in marker bits.
-        unit_px: Size of a marker bit in the photograph.
+    """Return a message if marks, counted by panel, are missing, blurred (edges in bits) or too small, otherwise "".
+    `unit_px` is the size of a marker bit in the photograph.
     """
     if sum(counts) == 0:
         return "shows no marks because the display is out of view or the picture is blurred or too dark"
@@ -134,15 +126,8 @@ def _unreadable(counts: list[int], edges: list[float], unit_px: float) -> str:
 
 
 def _covered(counts: list[int], places: F64, owners: Any) -> str:
-    """Return a message if a panel's marks are too few or too close together to locate the panel.
-
-    Args:
-        counts: Number of marks found on each panel.
-        places: Saddle points (K, 2), as fractions of their panel's width and height.
-        owners: Index (K,) of the panel that shows each saddle point.
-
-    Returns:
-        The message, or an empty string.
+    """Return a message if a panel's marks are too few or too close together to locate the panel, otherwise "". `places`
+    (K, 2) are the saddle points as fractions of the panel that shows each (`owners`).
     """
     fewest = min(counts)
     if fewest < MIN_MARKS:
@@ -166,17 +151,8 @@ def _unit_px(quad: F64) -> float:
 
 
 def _refined(picture: U8, guess: F64, quad: F64, *, window: int) -> tuple[Any, F64]:
-    """Locate a mark's four saddle points and check their contrast.
-
-    Args:
-        picture: Grey photograph (h, w).
-        guess: The saddle points' approximate positions (4, 2).
-        quad: The marker's corners (4, 2) in the photograph.
-        window: Half the search window's side length, in pixels.
-
-    Returns:
-        A mask (4,) that is True for points that are white along the mark's diagonal and black across it, and the
-        refined positions (4, 2).
+    """Locate a mark's four saddle points (4, 2) in a grey photograph, from a guess; `window` is half the search's side.
+    Also return a mask (4,) of points that are white along the mark's diagonal and black across it.
     """
     height, width = picture.shape
     inside = (
@@ -201,9 +177,8 @@ def _refined(picture: U8, guess: F64, quad: F64, *, window: int) -> tuple[Any, F
 
 
 def _quarter(out: F64, guess: F64) -> F64:
-    """Return offsets (4, 2) across the diagonal at each corner, about as long as the offsets `out`.
-
-    Each offset is parallel to the line between the neighbouring corners, which allows for perspective.
+    """Return offsets (4, 2) across the diagonal at each corner, about as long as the offsets `out`. Each offset is
+    parallel to the line between the neighbouring corners, which allows for perspective.
     """
     following, before = np.roll(guess, -1, axis=0) - guess, np.roll(guess, 1, axis=0) - guess
     return np.asarray((following - before) / 10 * 0.9, dtype=np.float64)
@@ -217,10 +192,8 @@ def _samples(picture: U8, points: F64) -> F64:
 
 
 def _edge_px(picture: U8, quad: F64) -> float:
-    """Return the width of a marker's outer edge in pixels, as a measure of blur.
-
-    Each side's width is its contrast divided by the steepest slope across the edge; the result is the median of the
-    four sides.
+    """Return the width of a marker's outer edge in pixels, a measure of blur: contrast over slope, median of four
+    sides.
     """
     widths = []
     centre = quad.mean(axis=0)

@@ -33,10 +33,7 @@ class PanelDisplay:
         self._sink.present(PanelFrame(self._number, layers, self._number))
 
     def key(self) -> Key | None:
-        """Return the next key that was pressed, or None.
-
-        The layers are presented again to keep the windows responsive. Raises PanelLost if a panel is lost.
-        """
+        """Return the next key pressed, or None, and present again to stay responsive. Raises PanelLost."""
         if self._layers is not None:
             self.show(self._layers)
         return self._keys.poll()
@@ -47,16 +44,8 @@ class PanelDisplay:
 
 
 def open_display(settings: Settings, *, registered: bool = False, grey_curve: bool = True) -> PanelDisplay:
-    """Open the configured panels.
-
-    Args:
-        registered: Apply the registration, that is, each panel's homography.
-        grey_curve: Apply each panel's gamma or LUT.
-
-    Raises:
-        InputError: The settings are not suitable for this machine.
-        MissingPart: OpenGL or X11 is not available.
-        PanelLost: A monitor is not connected.
+    """Open the configured panels, with each one's homography if `registered`, and its gamma or LUT if `grey_curve`.
+    Raises InputError for the settings, MissingPart without OpenGL or X11, and PanelLost without a monitor.
     """
     stack = settings.stack.stack()
     changes: dict[str, object] = {} if registered else {"homography": IDENTITY}
@@ -70,10 +59,7 @@ def open_display(settings: Settings, *, registered: bool = False, grey_curve: bo
 
 
 def show_until_key(display: PanelDisplay, layers: U8, title: str) -> None:
-    """Show layers (N, H, W, 4) until Enter or q is pressed, and close the display.
-
-    Raises PanelLost if a panel is lost.
-    """
+    """Show layers (N, H, W, 4) until Enter or q is pressed, and close the display. Raises PanelLost."""
     keys, clock = TerminalKeys(), MonotonicClock()
     try:
         display.show(layers)

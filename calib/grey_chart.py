@@ -65,10 +65,7 @@ class Patch:
 
 @lru_cache(maxsize=8)
 def patches(stack: PanelStack, panel: int) -> tuple[Patch, ...]:
-    """Lay out the patches of a panel's chart between its board's marks.
-
-    The greys and mixtures are in a random order that is always the same for a given panel.
-    """
+    """Lay out the patches of a panel's chart between its board's marks, in a random order fixed for the panel."""
     pitch = stack.width_px // PATCHES_ACROSS
     side = pitch * 5 // 6 // 8 * 8  # so that the measured half contains whole periods of the mixing pattern
     free = [
@@ -98,10 +95,7 @@ def _is_covered(stack: PanelStack, panel: int, left: int, top: int, side: int) -
 
 
 def grey_chart(stack: PanelStack, panel: int) -> U8:
-    """Draw a panel's chart as an (H, W) array.
-
-    The chart must be shown without resampling and without a LUT, while all other panels are at zero.
-    """
+    """Draw a panel's chart (H, W), to show without resampling or LUT while all other panels are at zero."""
     picture = board(stack, panel)
     for patch in patches(stack, panel):
         area = picture[patch.top_px : patch.top_px + patch.side_px, patch.left_px : patch.left_px + patch.side_px]
@@ -129,16 +123,9 @@ def lut_from_photographs(
     source: str,
     turns: AngleRange | None = None,
 ) -> dict[str, Any]:
-    """Measure a panel's grey curve from photographs of its chart, and write the LUT.
-
-    Args:
-        out: CSV file to write the LUT to.
-        pictures: The photographs' names and grey pixels (h, w).
-        source: Origin of the photographs, used in error messages.
-        turns: The panel's angles at black and full white, 0 and 90 degrees by default.
-
-    Raises:
-        InputError: A photograph is unusable, or the measured greys do not increase.
+    """Measure a panel's grey curve from photographs (names and grey pixels) of its chart, and write the LUT as CSV.
+    `turns` are the panel's angles at black and full white, by default 0 and 90 degrees. Raises InputError, which names
+    the `source`, if a photograph is unusable, or the measured greys do not increase.
     """
     measured = [histograms(picture, stack, panel, source=f"{source}, {name}") for name, picture in pictures]
     intensity, residual = measure(measured, stack, panel, source=source)
@@ -147,9 +134,8 @@ def lut_from_photographs(
 
 
 def write_lut(out: Path, intensity: F64, turns: AngleRange) -> None:
-    """Write a LUT with 256 rows of phase and grey (0 to 1), given the intensities (13,) of `GREYS`.
-
-    The intensities are relative: 0 at black and 1 at full white. Phases out of the panel's range get its nearest grey.
+    """Write 256 rows of phase and grey (0 to 1), given the intensities (13,) of `GREYS` from 0 (black) to 1 (white).
+    Phases out of the panel's range get its nearest grey.
     """
     # The square root of the intensity is smooth at both ends, for bare panels and for monitors with a tone curve.
     root = PchipInterpolator(np.array(GREYS) / 255, np.sqrt(np.maximum.accumulate(intensity)))
@@ -162,15 +148,8 @@ def write_lut(out: Path, intensity: F64, turns: AngleRange) -> None:
 
 
 def histograms(picture: U8, stack: PanelStack, panel: int, *, source: str) -> F64:
-    """Return a histogram of the pixel values in the middle of each patch, as a (P, 256) array.
-
-    Args:
-        picture: Grey photograph (h, w) of a chart.
-        panel: Index of the panel that shows the chart.
-        source: Name of the photograph, used in error messages.
-
-    Raises:
-        InputError: The photograph is too dark or overexposed, or does not show the entire chart.
+    """Return a histogram of the pixels in the middle of each patch (P, 256) of a grey photograph of a panel's chart.
+    Raises InputError, which names the `source`, if it is too dark or overexposed, or does not show the entire chart.
     """
     seen = find_marks(picture, stack, name="")
     mine, marks_seen = seen.panel == panel, seen.marks[panel]
@@ -200,22 +179,12 @@ def histograms(picture: U8, stack: PanelStack, panel: int, *, source: str) -> F6
 
 
 def measure(pictures: list[F64], stack: PanelStack, panel: int, *, source: str) -> tuple[F64, float]:
-    """Estimate the intensities of `GREYS` from histograms of photographs taken at the same exposure.
+    """Estimate the intensities (13,) of `GREYS` from the `histograms` of photographs taken at the same exposure.
 
     The fit determines the camera's tone curve, the uneven illumination in each photograph (its logarithm is modelled as
-    a quadratic polynomial in position) and the intensities of the greys.
-
-    Args:
-        pictures: Each photograph's patch histograms (P, 256).
-        panel: Index of the panel that shows the chart.
-        source: Origin of the photographs, used in error messages.
-
-    Returns:
-        The intensities (13,) from 0 to 1, and the median of the absolute residuals, each divided by its patch's
-        intensity (plus 0.02).
-
-    Raises:
-        InputError: The intensities do not increase from grey to grey.
+    a quadratic polynomial in position) and the intensities. Also return the median of the absolute residuals, each
+    divided by its patch's intensity (plus 0.02). Raises InputError if the intensities do not increase from grey to
+    grey.
     """
     chart = patches(stack, panel)
     place = np.array([[p.left_px / stack.width_px - 0.5, p.top_px / stack.height_px - 0.5] for p in chart])

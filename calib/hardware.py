@@ -31,21 +31,14 @@ CARD_CHARACTERS = 32  # maximum number of characters per line on an identity car
 
 
 class SetupHardware:
-    """Access to real hardware: monitors on X11, a sensor, a folder of photographs and the keyboard.
-
-    At most one set of windows and one sensor are open at a time, and `close` releases everything.
+    """Real hardware: monitors on X11, a sensor, a folder of photographs and the keyboard. At most one set of windows
+    and one sensor are open at a time, and `close` releases everything.
     """
 
     simulated = False
 
     def __init__(self, keys: Poll, *, photos: Path = Path("photos")) -> None:
-        """Store the arguments without opening any device.
-
-        Args:
-            keys: Function that returns the next key pressed in the terminal. Keys pressed in the panels' windows are
-                read as well.
-            photos: Folder where the user puts the photographs.
-        """
+        """Open nothing yet; `keys` returns the terminal's next key, `photos` is where the user puts photographs."""
         self._keys, self._photos = keys, photos
         self._clock = MonotonicClock()
         self._display: PanelDisplay | None = None  # the windows that are open
@@ -55,10 +48,7 @@ class SetupHardware:
         self._frames: list[SensorFrame] = []  # received, but not yet returned by `sample`
 
     def poll(self) -> Key | None:
-        """Return the next key pressed in the terminal or in a panel's window, or None.
-
-        Calling this also keeps the windows responsive.
-        """
+        """Return the next key pressed in the terminal or a panel's window, or None, and keep the windows responsive."""
         return self._keys() or (self._display.key() if self._display is not None else None)
 
     def key(self) -> Key:
@@ -72,10 +62,7 @@ class SetupHardware:
         self._clock.sleep_until_ns(self._clock.now_ns() + POLL_NS)
 
     def monitors(self) -> tuple[Monitor, ...]:
-        """Open a window on every active monitor and return the monitors.
-
-        Raises InputError if there is no X server or active monitor, or if a window cannot be opened.
-        """
+        """Open a window on every active monitor and return the monitors. Raises InputError if that fails."""
         self.let_go()
         try:
             panels, cards, monitors = every_monitor()
@@ -85,12 +72,7 @@ class SetupHardware:
         return monitors
 
     def show_card(self, number: int, words: Sequence[str]) -> None:
-        """Show a card with lines of text on one monitor, and clear the other monitors.
-
-        Args:
-            number: Index of the monitor in the tuple returned by `monitors`.
-            words: Lines of text to show. Long lines are wrapped.
-        """
+        """Show a card with lines of text, wrapped, on one of `monitors`, and clear the others."""
         cards, monitors = self._cards
         height, width = cards[number].shape[:2]
         lines = [line for text in words for line in wrap(text, CARD_CHARACTERS)]
@@ -99,17 +81,9 @@ class SetupHardware:
             self._display.show(alone([*cards[:number], card, *cards[number + 1 :]], number))
 
     def photographs(self, settings: Settings, pictures: U8, *, panel: int | None, say: Say) -> Iterator[Named]:
-        """Show pictures on the panels without registration, wait for the user's photographs and return them.
-
-        Args:
-            pictures: (N, H, W) grey pictures, one per panel: the boards, or the grey chart on one panel and nothing on
-                the others.
-            panel: Index of the panel that shows the grey chart, with no grey curve applied, or None if the boards are
-                shown.
-
-        Raises:
-            InputError: The user stopped, or the folder has no readable photographs.
-            PanelLost: A panel was lost.
+        """Show (N, H, W) grey pictures without registration, wait for the user's photographs and return them. `panel`
+        is the one that shows the grey chart, with no grey curve, or None for the boards. Raises InputError if the user
+        stopped or there are no readable photographs, and PanelLost.
         """
         self.let_go()
         folder = self._photos if panel is None else self._photos / f"grey-{panel}"
@@ -128,11 +102,8 @@ class SetupHardware:
         return photographs(folder)
 
     def open_sensor(self, settings: Settings) -> str:
-        """Start the sensor, wait until it works, and return its name and serial number.
-
-        Raises:
-            InputError: The driver is unknown, the sensor does not start working in time, or it needs no calibration
-                because it delivers eyes in the stack frame.
+        """Start the sensor, wait until it works, and return its name and serial number. Raises InputError if the driver
+        is unknown, it does not work in time, or it delivers eyes in the stack frame.
         """
         self._stop_sensor()
         open_sensor(settings.sensor, self._clock)  # refuses unknown names before anything starts
@@ -159,10 +130,8 @@ class SetupHardware:
         return f"{settings.sensor.driver} {worker.serial}".strip()
 
     def sample(self, standing_at: Viewpoint) -> Sample | None:
-        """Return the sensor's next sample, or None if no sample has arrived.
-
-        Samples are queued, so slow panels do not cause any to be lost. `standing_at` is the viewpoint that the user was
-        asked to move to; only the simulation uses it.
+        """Return the sensor's next sample, queued while panels were slow, or None. Only the simulation uses
+        `standing_at`.
         """
         if self._worker is None:
             return None

@@ -39,11 +39,7 @@ _OF_BYTES = {data: key for key, (_, pieces) in _MEANINGS.items() for data in pie
 
 
 def parse(data: bytes) -> tuple[list[Key], bytes]:
-    """Decode bytes from a terminal.
-
-    Returns:
-        The keys, and the bytes of any escape sequence that is still incomplete.
-    """
+    """Decode bytes from a terminal into keys, and the bytes of an escape sequence that is still incomplete."""
     keys: list[Key] = []
     while data:
         if data[:1] == b"\x1b" and len(data) < 3 and b"\x1b[".startswith(data[:2]):
@@ -56,18 +52,10 @@ def parse(data: bytes) -> tuple[list[Key], bytes]:
 
 
 class TerminalKeys:
-    """Reader for keys and lines from standard input.
-
-    The first `poll` switches a terminal to character mode, and `close` restores the previous mode.
-    """
+    """Reader for standard input: the first `poll` sets a terminal to character mode, and `close` restores it."""
 
     def __init__(self, descriptor: int | None = None, *, quit_at_end: bool = True) -> None:
-        """Choose the input without changing the terminal's mode.
-
-        Args:
-            descriptor: File descriptor to read. Defaults to standard input.
-            quit_at_end: Report the end of input as the `QUIT` key. Otherwise no more keys are reported.
-        """
+        """Choose a file descriptor, by default standard input, whose end is reported as `QUIT` or never."""
         self._quit_at_end = quit_at_end
         self._descriptor = _standard_input() if descriptor is None else descriptor
         self._rest = b""
@@ -93,10 +81,7 @@ class TerminalKeys:
         return None
 
     def line(self) -> str:
-        """Wait for the next line and return it with leading and trailing whitespace removed.
-
-        Returns `q` at end of input.
-        """
+        """Wait for the next line, stripped, or `q` at end of input."""
         self.close()
         data = b""
         while self._descriptor >= 0 and (read := os.read(self._descriptor, 1)) != b"\n":
@@ -123,10 +108,7 @@ def _standard_input() -> int:
 
 
 class WindowKeys:
-    """Reader for keys pressed in the panels' windows.
-
-    GLFW delivers the keys when a frame is presented.
-    """
+    """Reader for keys pressed in the panels' windows, which GLFW delivers when a frame is presented."""
 
     def __init__(self, sink: PanelSink) -> None:
         self._sink = sink
@@ -134,10 +116,7 @@ class WindowKeys:
         self._pending: list[Key] = []
 
     def poll(self) -> Key | None:
-        """Return the next key without waiting, or None if no key was pressed.
-
-        Must be called after a frame has been presented, in the thread that created the windows.
-        """
+        """Return the next key or None, after a frame was presented in the thread that created the windows."""
         handles = self._sink.window_handles
         if handles != self._watched:
             self._watch(handles)

@@ -1,7 +1,4 @@
-"""Read, validate and store pairs of points.
-
-Each pair consists of a point measured in the sensor frame and the same point's known position in the stack frame.
-"""
+"""Pairs of a point measured in the sensor frame and the same point's known position in the stack frame."""
 
 from __future__ import annotations
 
@@ -85,13 +82,9 @@ class Pairs:
 
 
 def read_pairs(path: Path) -> Pairs:
-    """Read pairs from a CSV file whose header contains `COLUMNS`, or from a JSON file.
-
-    A JSON file contains a list of objects, or an object `{"pairs": [...]}` with such a list.
-
-    Raises:
-        InputError: The file cannot be read, has too many pairs or pairs from different sensors, or contains invalid
-            values. The message names the rows and columns.
+    """Read pairs from a CSV file whose header contains `COLUMNS`, or from a JSON list or `{"pairs": [...]}`. Raises
+    InputError, which names rows and columns, if the file cannot be read, has too many pairs or pairs from different
+    sensors, or contains invalid values.
     """
     labels, rows = _read_rows(path)
     if len(rows) > MAX_PAIRS:
@@ -109,10 +102,7 @@ def read_pairs(path: Path) -> Pairs:
 
 
 def _read_rows(path: Path) -> tuple[list[str], list[PairRow]]:
-    """Read a file, and return a label for each pair (its line or number) as well as the pairs.
-
-    Raises InputError if the file cannot be read or a value is invalid. The message names the rows and columns.
-    """
+    """Read a file, and return each pair's label (line or number) and the pairs. Raises InputError as `read_pairs`."""
     text = untrusted_input.read_text(path)
     if path.suffix.lower() == ".json":
         value = untrusted_input.parsed_json(text, source=path)
@@ -160,10 +150,7 @@ def points_of(rows: Iterable[PairRow]) -> tuple[F64, F64]:
 
 
 class PairsFile:
-    """CSV file of the pairs accepted so far.
-
-    Every change is written immediately, so no pair is lost if the program is interrupted.
-    """
+    """CSV file of the pairs accepted so far, written at every change so that none is lost."""
 
     def __init__(self, path: Path) -> None:
         """Continue an existing file or start a new one. Raises InputError if an existing file is invalid."""
@@ -181,10 +168,7 @@ class PairsFile:
         return len(self.rows)
 
     def accept(self, *pairs: PairRow) -> None:
-        """Add pairs from one sensor and write the file. Existing pairs at the same viewpoints are replaced.
-
-        Raises InputError if the file has pairs from another sensor, or cannot be written.
-        """
+        """Add one sensor's pairs, instead of those at the same viewpoints. Raises InputError for another's."""
         serial, replaced = pairs[0].sensor_serial, {pair.viewpoint for pair in pairs} - {""}
         others = {row.sensor_serial for row in self.rows} - {"", serial}
         if others and serial:

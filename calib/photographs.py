@@ -18,10 +18,7 @@ SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
 
 
 def photographs(folder: Path) -> Iterator[tuple[str, U8]]:
-    """Yield the name and the grey pixels (h, w) of each photograph in a folder, sorted by name.
-
-    Raises InputError if the folder contains no photographs or too many, or if a photograph cannot be read.
-    """
+    """Yield the name and grey pixels (h, w) of each photograph in a folder, by name. Raises InputError."""
     if not untrusted_input.is_there(folder, folder=True):
         raise InputError(folder, "", "is not a folder")
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
@@ -34,10 +31,7 @@ def photographs(folder: Path) -> Iterator[tuple[str, U8]]:
 
 
 def read_photograph(path: Path) -> U8:
-    """Read a photograph as grey pixels (h, w). The EXIF orientation is ignored.
-
-    Raises InputError if the photograph cannot be read or decoded.
-    """
+    """Read a photograph as grey pixels (h, w), without its EXIF orientation. Raises InputError."""
     data, _ = read_coded(path)
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
     picture = None if is_cut_off(data) else cv2.imdecode(np.frombuffer(data, np.uint8), flags)

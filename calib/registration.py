@@ -69,15 +69,8 @@ def homographies(panels: Sequence[PlacedPanel], stack: PanelStack, eye_m: F64) -
 
 
 def geometry_of(panels: Sequence[PlacedPanel], stack: PanelStack, *, eye_m: F64) -> PanelStack:
-    """Return the geometry to configure for panels at their measured poses.
-
-    Args:
-        panels: The panels' poses, from rear to front.
-        stack: Configured geometry, whose distances and tilts are replaced.
-        eye_m: Viewing position (3,) that the panels are registered for, in the `stack` frame.
-
-    Raises:
-        Undetermined: The panels are not in the configured order.
+    """Return the geometry to configure for panels at their measured poses, registered for the viewing position `eye_m`.
+    Raises Undetermined if the panels are not in the configured order.
     """
     x_m = tuple(panel.axis_x_m for panel in panels)
     if any(b <= a for a, b in pairwise(x_m)):
@@ -88,17 +81,9 @@ def geometry_of(panels: Sequence[PlacedPanel], stack: PanelStack, *, eye_m: F64)
 
 
 def register_photographs(seen: Sequence[SeenMarks], stack: PanelStack, *, eye_m: F64) -> Registration:
-    """Fit the panels' poses to the marks found in photographs, and check the result.
-
-    Photographs that are faulty, differ in size or contradict the others are excluded.
-
-    Args:
-        seen: Marks found in each photograph.
-        eye_m: Viewing position (3,) that the panels are registered for, in the `stack` frame.
-
-    Raises:
-        Undetermined: The photographs are too few, too similar or inconsistent, or the result is implausible or too
-            uncertain. The message gives the reason.
+    """Fit the panels' poses, for the viewing position `eye_m`, to the marks found in photographs, and check the result.
+    Photographs that are faulty, differ in size or contradict the others are excluded. Raises Undetermined, with the
+    reason, if they are too few, too similar or inconsistent, or the result is implausible or too uncertain.
     """
     reference = stack.count // 2
     excluded = {s.name: s.fault for s in seen if s.fault}
@@ -191,17 +176,9 @@ def _refuse_implausible(bundle: Bundle, stack: PanelStack) -> None:
 def register_photos(
     pictures: Iterable[tuple[str, U8]], source: str, out: Path, settings: Settings, *, config: Path | None
 ) -> dict[str, Any]:
-    """Register the panels from photographs and write `registration.json`.
-
-    Args:
-        pictures: The photographs' names and grey pixels (h, w).
-        source: Origin of the photographs, used in error messages.
-        out: Folder for `registration.json`.
-        config: Configuration file to update with the registration, or None.
-
-    Raises:
-        InputError: The photographs do not determine the panels' poses, `config` describes a different number of panels
-            or cannot be updated, or `out` cannot be written to. `registration.json` is then not written.
+    """Register the panels from photographs (names and grey pixels), and write `out/registration.json` and the `config`.
+    Raises InputError, which names the `source`, if they do not determine the panels' poses, `config` has a different
+    number of panels or cannot be updated, or `out` cannot be written to. `registration.json` is then not written.
     """
     stack = settings.stack.stack()
     if config is not None and len(settings.output.panels) not in (0, stack.count):

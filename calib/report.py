@@ -47,17 +47,9 @@ class Points(NamedTuple):
 
 
 def write_report(file: Path, out: Path, *, viewing: CalibrationSettings) -> dict[str, Any]:
-    """Write a page about a calibration, with its plots as PNG files and its figures in `report.json`.
-
-    Args:
-        file: Calibration file.
-        viewing: Viewing range settings. The error at the eye is averaged over this range.
-
-    Returns:
-        The contents of `report.json`.
-
-    Raises:
-        InputError: The calibration file is invalid, or the page cannot be written.
+    """Write a page about a calibration, with its plots as PNG files and its figures in `report.json`, and return these.
+    The error at the eye is averaged over the `viewing` range. Raises InputError for an invalid file, or if it cannot
+    write.
     """
     calibration, table = load_calibration(file), read_table(file)
     points = _stored_points(table.get("data"), calibration, source=file)
@@ -81,10 +73,7 @@ def write_report(file: Path, out: Path, *, viewing: CalibrationSettings) -> dict
 
 
 def _stored_points(data: Any, calibration: Calibration, *, source: Path) -> Points | None:
-    """Return the errors of the pairs listed in a file's `[data]` table, or None if it has no pairs.
-
-    Raises InputError if the table is invalid.
-    """
+    """Return the errors of the pairs in a file's `[data]`, or None. Raises InputError if it is invalid."""
     if not isinstance(data, dict) or "sensor_m" not in data:
         return None
     found = validated(StoredPairs, data, source=f"{source}: data")
@@ -92,15 +81,7 @@ def _stored_points(data: Any, calibration: Calibration, *, source: Path) -> Poin
 
 
 def residual_figure(points: Points, *, limit_m: float) -> bytes:
-    """Plot every calibration point's errors in mm, as in the EyeReal supplement's figure S5.
-
-    Args:
-        points: Errors at the calibration points.
-        limit_m: Error to mark with dashed lines, in metres.
-
-    Returns:
-        The plot as a PNG file.
-    """
+    """Plot every point's errors in mm, as in EyeReal's figure S5, with dashed lines at `limit_m`, and return a PNG."""
     residual_m, used = points.residual_m, points.used
     with drawing(9, 6.5) as canvas:
         axes = canvas.subplots(nrows=3, sharex=True, sharey=True)

@@ -34,19 +34,15 @@ class RobustFit:
 
 
 def _residuals(candidate: Similarity, sensor_m: F64, stack_m: F64) -> F64:
-    """Return the squared errors (..., K) in m², divided by the squared scale.
-
-    Without this division, similarities with a small scale would seem better.
-    """
+    """Return squared errors (..., K) in m² over the squared scale, which would otherwise favour small scales."""
     squared = ((candidate.points(sensor_m) - stack_m) ** 2).sum(-1)
     residuals: F64 = squared / np.maximum(candidate.scale[..., None], 1e-300) ** 2
     return residuals
 
 
 def _best_half(sensor_m: F64, stack_m: F64, *, random: np.random.Generator) -> NDArray[np.intp]:
-    """Return the indices of the half of the pairs that agree best.
-
-    The search starts from many random subsets. Each fit is then repeated on the half of the pairs that it fits best.
+    """Return the indices of the half of the pairs that agree best. The search starts from many random subsets. Each fit
+    is then repeated on the half of the pairs that it fits best.
     """
     count = len(sensor_m)
     keep = min(count, max(3, (count + 5) // 2))
@@ -63,16 +59,8 @@ def _best_half(sensor_m: F64, stack_m: F64, *, random: np.random.Generator) -> N
 
 
 def fit_robust(sensor_m: F64, stack_m: F64) -> RobustFit:
-    """Fit a similarity to those pairs that agree with each other. The result is deterministic.
-
-    Among five pairs or fewer there is no clear majority, so all of them are used.
-
-    Args:
-        sensor_m: Points (K, 3) in the `sensor` frame, where K is at least 3.
-        stack_m: The same points (K, 3) in the `stack` frame.
-
-    Raises:
-        Degenerate: The points do not determine a similarity, as in `similarity.fit`.
+    """Fit a similarity, deterministically, to those of K >= 3 points (K, 3) in `sensor` and `stack` that agree. Among
+    five pairs or fewer there is no clear majority, so all of them are used. Raises Degenerate as `similarity.fit`.
     """
     count = len(sensor_m)
     everything = fit(sensor_m, stack_m, rule=RULE)
@@ -106,9 +94,6 @@ def fit_robust(sensor_m: F64, stack_m: F64) -> RobustFit:
 
 
 def _noise(similarity: Similarity, sensor_m: F64, stack_m: F64, inlier: NDArray[np.bool_]) -> float:
-    """Return the inliers' standard deviation per coordinate in the `stack` frame.
-
-    The fit's seven parameters are subtracted from the degrees of freedom.
-    """
+    """Return the inliers' deviation per coordinate in `stack`, with seven degrees of freedom less for the fit."""
     squared = ((similarity.points(sensor_m) - stack_m) ** 2).sum(-1)[inlier].sum()
     return float(np.sqrt(squared / max(3 * int(inlier.sum()) - 7, 1)))

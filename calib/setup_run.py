@@ -1,7 +1,4 @@
-"""Guide the user through setting up a display, which can be interrupted and resumed.
-
-Used by the `phasestack setup` command.
-"""
+"""Guide the user through setting up a display (`phasestack setup`), which can be interrupted and resumed."""
 
 from __future__ import annotations
 
@@ -28,10 +25,7 @@ def progress_path(config: Path) -> Path:
 
 
 def read_progress(path: Path) -> dict[str, Any]:
-    """Return the finished steps' figures, keyed by step name.
-
-    Raises InputError if the file is invalid.
-    """
+    """Return the finished steps' figures by step. Raises InputError if the file is invalid."""
     if not untrusted_input.is_there(path):
         return {}
     try:
@@ -45,20 +39,9 @@ def read_progress(path: Path) -> dict[str, Any]:
 def run_setup(
     config: Path, *, out: Path, photos: Path, simulate: bool, seed: int, to_stderr: bool
 ) -> tuple[dict[str, Any], str]:
-    """Run the setup interactively.
-
-    Args:
-        config: Configuration file to create or change.
-        out: Folder for reports and for the files that the configuration uses.
-        photos: Folder where the user puts photographs.
-        simulate: Simulate the monitors, the panels and the sensor.
-        to_stderr: Write all messages to stderr instead of stdout.
-
-    Returns:
-        The summary as a dictionary and as text.
-
-    Raises:
-        InputError: The configuration file or the progress file is invalid.
+    """Create or change a configuration interactively, and return the summary as a dictionary and as text. Reports and
+    the configuration's files go to `out`, the user's photographs to `photos`. Raises InputError if the configuration
+    file or the progress file is invalid.
     """
 
     def say(text: str) -> None:
@@ -82,10 +65,7 @@ def run_setup(
 
 
 def walk_through(setup: Setup) -> bool:
-    """Run the steps from the first unfinished one.
-
-    Returns True after the last step, or False if the user stops.
-    """
+    """Run the steps from the first unfinished one. Returns False if the user stops."""
     number = next((n for n, step in enumerate(STEPS) if step.name not in setup.done), 0)
     while number < len(STEPS):
         step = STEPS[number]
@@ -117,10 +97,7 @@ def _is_done(setup: Setup, step: SetupStep) -> bool:
 
 
 def summarise(setup: Setup, *, finished: bool) -> tuple[dict[str, Any], str]:
-    """Return the summary as a dictionary and as text. If the setup is finished, it is also written.
-
-    The text ends with the commands to run next.
-    """
+    """Return the summary as a dictionary and as text with the next commands, and write it if finished."""
     missing = [step.name for step in STEPS if step.name not in setup.done]
     summary: dict[str, Any] = {
         "config": str(setup.config),

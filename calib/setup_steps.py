@@ -57,10 +57,7 @@ class Setup:
         return load_settings(self.config if untrusted_input.is_there(self.config) else None)
 
     def ask(self, question: str, default: str = "") -> str:
-        """Ask a question and return the answer, or `default` for an empty line.
-
-        Raises SetupStopped if the answer is q.
-        """
+        """Ask a question and return the answer, or `default` for an empty line. Raises SetupStopped for q."""
         self.say(f"{question} [{default or 'Enter'}; q: stop]")
         answer = self.line()
         if answer == "q":
@@ -79,10 +76,7 @@ class SetupStep:
 
 
 def identify(setup: Setup) -> Figures:
-    """Step 1: assign the monitors to the panels and determine how each panel is mounted.
-
-    One monitor at a time shows a card, and the user answers questions about it.
-    """
+    """Step 1: assign monitors to panels and find each one's mounting, by questions about a card on one at a time."""
     hardware, count = setup.hardware, setup.settings.stack.stack().count
     monitors = hardware.monitors()
     if len(monitors) < count:
@@ -121,10 +115,7 @@ def _name_of(monitor: Monitor, monitors: Sequence[Monitor]) -> dict[str, Any]:
 
 
 def geometry(setup: Setup) -> Figures:
-    """Step 2: ask for the panels' size, the approximate gap and the viewing distances.
-
-    The exact gaps are measured later, during registration.
-    """
+    """Step 2: ask for the panels' size, the approximate gap (registration measures it) and the viewing distances."""
     stack, calibration = setup.settings.stack, setup.settings.calibration
 
     def length_m(question: str, value_m: float, unit_m: float = 1e-3) -> float:
@@ -172,10 +163,7 @@ def registration(setup: Setup) -> Figures:
 
 
 def grey(setup: Setup) -> Figures:
-    """Step 4: measure each panel's grey curve from photographs of a chart.
-
-    Each curve is saved as soon as it is measured.
-    """
+    """Step 4: measure each panel's grey curve from photographs of a chart, and save it at once."""
     stack = setup.settings.stack.stack()
     known = [bool(panel.lut) for panel in setup.settings.output.panels] or [False] * stack.count
     residuals = [0.0]
@@ -245,10 +233,7 @@ def calibration(setup: Setup) -> Figures:
 
 
 def service(setup: Setup) -> Figures:
-    """Step 7: collect the service's files in a folder and install them.
-
-    Without root permissions, or in a simulation, the installation commands are printed instead.
-    """
+    """Step 7: collect the service's files and install them, or print the commands without root or in a simulation."""
     folder = (setup.out / "service").resolve()
     files = gather(setup.config, folder)
     sudo = "" if os.geteuid() == 0 else "sudo "
@@ -270,10 +255,8 @@ def service(setup: Setup) -> Figures:
 
 
 def gather(config: Path, out: Path) -> list[str]:
-    """Copy the configuration, the calibration and the grey curves to a folder, and return the file names.
-
-    All other files stay where they are, and the copied configuration refers to them by absolute paths. Raises
-    InputError if a file cannot be read or written.
+    """Copy configuration, calibration and grey curves to a folder, and return their names. Raises InputError. All other
+    files stay where they are, and the copied configuration refers to them by absolute paths.
     """
     if not config.exists():
         raise InputError(config, "", "does not exist yet; run the earlier steps first")

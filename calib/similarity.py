@@ -30,10 +30,7 @@ POLISH_ABOVE = 1e2  # ratio of the points' two largest extents above which the c
 
 
 class Degenerate(ValueError):
-    """Raised if the points do not determine a similarity in double precision.
-
-    The message gives the reason.
-    """
+    """Raised, with the reason, if the points do not determine a similarity in double precision."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,10 +57,7 @@ class Similarity:
 
 
 def _centred(points: F64) -> tuple[F64, F64]:
-    """Return the centred points and their mean.
-
-    The mean is computed in two passes to preserve precision for points far from the origin.
-    """
+    """Return the centred points and their mean, in two passes for the precision of points far from the origin."""
     mean = np.zeros((*points.shape[:-2], 1, 3))
     for _ in range(2):
         mean = mean + (points - mean).mean(axis=-2, keepdims=True)
@@ -81,10 +75,7 @@ def _scale(rule: ScaleRule, *, sensor_power: F64, stack_power: F64, correlation:
 
 
 def fit_batch(sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> Similarity:
-    """Fit a similarity to each set of pairs in a batch (..., K, 3), without checks.
-
-    Degenerate points result in infinities or NaN.
-    """
+    """Fit a similarity to each batch of pairs (..., K, 3) unchecked: degenerate points give infinities or NaN."""
     sensor, sensor_mean = _centred(sensor_m)
     stack, stack_mean = _centred(stack_m)
     left, values, right = np.linalg.svd(np.swapaxes(sensor, -1, -2) @ stack)
@@ -113,17 +104,11 @@ def extents(points_m: F64) -> F64:
 
 
 def fit(sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> Similarity:
-    """Fit a similarity to pairs of points in full double precision.
+    """Fit a similarity to K >= 3 points (K, 3) in `sensor` and `stack` in full double precision.
 
-    Args:
-        sensor_m: Points (K, 3) in the `sensor` frame, where K is at least 3.
-        stack_m: The same points (K, 3) in the `stack` frame.
-        rule: Rule for the scale, or the known scale.
-
-    Raises:
-        Degenerate: The points are too few, not finite, coincident, collinear or uncorrelated. Also raised if the points
-            are so nearly collinear or so far from the origin that rounding errors alone could rotate the result by
-            more than `ROTATION_BOUND_RAD`. Measurement noise is not considered.
+    `rule` is a rule for the scale, or the known scale. Raises Degenerate if the points are too few, not finite,
+    coincident, collinear or uncorrelated, or so nearly collinear or so far from the origin that rounding errors alone
+    could rotate the result by more than `ROTATION_BOUND_RAD`. Measurement noise is not considered.
     """
     if len(sensor_m) < 3:
         raise Degenerate(f"there are only {len(sensor_m)} pairs, but at least 3 are needed")
@@ -170,12 +155,6 @@ def _polished(start: Similarity, sensor_m: F64, stack_m: F64, *, rule: ScaleRule
     stack's points, the rotation about the long axis has a closed form that involves only the small coordinates. The
     other two rotations are refined by Gauss-Newton steps, solved with NumPy's `lstsq`. The error then grows with the
     aspect ratio rather than with its square.
-
-    Args:
-        start: Fit to refine.
-        sensor_m: Points (K, 3) in the `sensor` frame.
-        stack_m: The same points (K, 3) in the `stack` frame.
-        rule: Rule for the scale, or the known scale.
     """
     sensor, sensor_mean = _centred(sensor_m)
     stack, stack_mean = _centred(stack_m)

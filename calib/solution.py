@@ -27,9 +27,8 @@ MIN_SIGMA = 1e-12  # minimum standard deviation of the scale's logarithm, for ex
 
 @dataclass(frozen=True, slots=True)
 class CalibrationSolution:
-    """A calibration computed from K pairs by one method, with its residuals and covariance.
-
-    The seven parameters and the pivot are defined in `runtime.eyes.calibration`.
+    """A calibration computed from K pairs by one method, with its residuals and covariance. The seven parameters and
+    the pivot are defined in `runtime.eyes.calibration`.
     """
 
     method: Method
@@ -68,14 +67,8 @@ class CalibrationSolution:
         return float(np.sqrt(self.covariance[6, 6]))
 
     def eye_error_m(self, stack_m: F64, *, noise_m: float | None = None) -> F64:
-        """Return the calibration's expected RMS error at the given points, in metres.
-
-        Args:
-            stack_m: Points (..., 3) in the `stack` frame.
-            noise_m: Standard deviation of the pairs, per coordinate. Defaults to the observed noise.
-
-        Returns:
-            An array (...) with the error at each point.
+        """Return the expected RMS error (...) at points (..., 3) in `stack`, in metres. `noise_m` is the pairs'
+        deviation per coordinate, by default that observed.
         """
         jacobian = position_jacobian(stack_m, pivot_m=self.pivot_m)
         covariance = self.unit_covariance * (self.noise_m if noise_m is None else noise_m) ** 2
@@ -84,15 +77,12 @@ class CalibrationSolution:
 
 
 def design_covariance(stack_m: F64, *, fixed_scale: bool) -> tuple[F64, F64, float]:
-    """Return the pivot (3,), the covariance (7, 7) for noise of 1 m, and the design's condition number.
+    """Return the pivot (3,), the covariance (7, 7) for noise of 1 m, and the condition number of points (K, 3) in
+    `stack`.
 
     The covariance is a first-order approximation that assumes equal, independent noise in every coordinate. If the
     noise is given in the sensor frame, multiply it by the scale first. If the points leave a parameter undetermined,
-    the covariance and the condition number are infinite.
-
-    Args:
-        stack_m: Known points (K, 3) in the `stack` frame.
-        fixed_scale: Treat the scale as known, with zero variance.
+    the covariance and the condition number are infinite. A fixed scale has zero variance.
     """
     pivot_m = stack_m.mean(0)
     radius_m = float(np.sqrt(((stack_m - pivot_m) ** 2).sum(-1).mean())) or 1.0
@@ -114,16 +104,9 @@ def design_covariance(stack_m: F64, *, fixed_scale: bool) -> tuple[F64, F64, flo
 def solve(
     sensor_m: F64, stack_m: F64, *, method: Method, known_scale: float = 1.0, reason: str = ""
 ) -> CalibrationSolution:
-    """Compute a calibration from pairs by one method, with all its error estimates.
-
-    Args:
-        sensor_m: Measured points (K, 3) in the `sensor` frame.
-        stack_m: Known points (K, 3) in the `stack` frame.
-        known_scale: Scale for the `fixed-scale` method.
-        reason: Reason for choosing the method, stored with the result.
-
-    Raises:
-        Degenerate: The points do not determine a similarity, as in `similarity.fit`.
+    """Compute a calibration from points (K, 3), measured in `sensor` and known in `stack`, with all its error
+    estimates. `known_scale` is for `fixed-scale`; the `reason` for the method is stored. Raises Degenerate as
+    `similarity.fit`.
     """
     used = np.ones(len(sensor_m), bool)
     if method == "robust":
@@ -148,15 +131,11 @@ def solve(
 
 
 def posterior_scale(fitted: float, *, sigma: float, freedom: int) -> tuple[float, float]:
-    """Return the mean and standard deviation of the log scale's posterior.
+    """Return the mean and standard deviation of the log scale's posterior, averaged over the kinds of sensors.
 
-    The posterior is averaged over the kinds of sensors, which avoids a threshold between the kinds. It also leaves the
-    fitted scale nearly unchanged for a sensor whose scale is off by a tenth.
-
-    Args:
-        fitted: Logarithm of the fitted scale.
-        sigma: Standard deviation of `fitted`, as estimated from the residuals.
-        freedom: Degrees of freedom of the estimate `sigma`. They make the likelihood a Student's t distribution.
+    This avoids a threshold between the kinds, and leaves the fitted scale nearly unchanged for a sensor whose scale is
+    off by a tenth. `sigma`, of the logarithm `fitted`, was estimated from residuals with `freedom` degrees, which make
+    the likelihood a Student's t distribution.
     """
     shares, widths = SCALE_PRIOR.T
     noise = max(sigma, MIN_SIGMA) ** 2
@@ -169,17 +148,11 @@ def posterior_scale(fitted: float, *, sigma: float, freedom: int) -> tuple[float
 
 
 def solve_default(sensor_m: F64, stack_m: F64) -> CalibrationSolution:
-    """Compute a calibration by the method with the least expected error at the eye.
+    """Compute a calibration from points (K, 3) by the method with the least expected error at the eye.
 
     If some pairs have gross errors, the method is `robust`. Otherwise it is `fixed-scale` with the scale's posterior
-    mean, which is close to 1 unless the pairs contradict that. tests/calib/test_methods.py compares the methods.
-
-    Args:
-        sensor_m: Measured points (K, 3) in the `sensor` frame.
-        stack_m: Known points (K, 3) in the `stack` frame.
-
-    Raises:
-        Degenerate: The points do not determine a similarity, as in `similarity.fit`.
+    mean, which is close to 1 unless the pairs contradict that. tests/calib/test_methods.py compares the methods. Raises
+    Degenerate as `similarity.fit`.
     """
     robust = solve(sensor_m, stack_m, method="robust")
     rejected = int((~robust.used).sum())

@@ -1,7 +1,4 @@
-"""Define the calibration viewpoints and the viewing volume.
-
-The viewpoints are the ones in section 2.3 of EyeReal, extended to any distance.
-"""
+"""Calibration viewpoints of section 2.3 of EyeReal, extended to any distance, and the viewing volume."""
 
 from __future__ import annotations
 
@@ -20,10 +17,7 @@ IPD_M = 0.060  # the paper's distance between the eyes, used if the configuratio
 
 @dataclass(frozen=True, slots=True)
 class Viewpoint:
-    """Position at which a calibration requires the midpoint between the eyes to be placed.
-
-    The coordinates are spherical.
-    """
+    """Position of the midpoint between the eyes that a calibration requires, in spherical coordinates."""
 
     radius_cm: int  # distance from the stack's origin
     phi_deg: int  # angle from the vertical
@@ -35,17 +29,11 @@ class Viewpoint:
 
     @property
     def midpoint_m(self) -> F64:
-        """Position (3,) in the `stack` frame.
-
-        It is x = R sin(phi) sin(theta), y = R sin(phi) cos(theta), z = R cos(phi).
-        """
+        """Position (3,) in `stack`: x = R sin(phi) sin(theta), y = R sin(phi) cos(theta), z = R cos(phi)."""
         return spherical_m(self.radius_cm / 100, phi_deg=self.phi_deg, theta_deg=self.theta_deg)
 
     def eyes_m(self, ipd_m: float = IPD_M) -> F64:
-        """Return the left and right eyes' positions in the `stack` frame, as a (2, 3) array.
-
-        The line between the eyes is horizontal and perpendicular to the line of sight to the stack's centre.
-        """
+        """Return the (2, 3) eyes in `stack`, on a horizontal line perpendicular to the line of sight to the centre."""
         right = stack_from_eye(self.midpoint_m)[:3, 0]
         return self.midpoint_m + np.outer([-ipd_m / 2, ipd_m / 2], right)
 
@@ -63,10 +51,7 @@ def viewing_place_m(viewing: CalibrationSettings) -> F64:
 
 
 def grid(viewing: CalibrationSettings = USUAL) -> tuple[Viewpoint, ...]:
-    """Return the 27 viewpoints of a viewing range, nearest first.
-
-    The default range gives EyeReal's viewpoints.
-    """
+    """Return the 27 viewpoints of a viewing range, nearest first; the default range gives EyeReal's."""
     low_deg, high_deg = viewing.viewing_up_deg
     radii_cm = np.rint(100 * np.linspace(*viewing.viewing_m, 3)).astype(int)
     phi_deg = np.rint(90 - np.linspace(high_deg, low_deg, 3)).astype(int)
@@ -75,11 +60,9 @@ def grid(viewing: CalibrationSettings = USUAL) -> tuple[Viewpoint, ...]:
 
 
 def viewing_volume_m(viewing: CalibrationSettings = USUAL) -> F64:
-    """Return points (125, 3) in the `stack` frame that span the viewers' range of movement.
-
-    The volume is larger than the grid of viewpoints: it reaches from 0.75 times the nearest to 1.5 times the farthest
-    distance, and 15 degrees farther to each side and 10 degrees farther up and down. By default it reaches from 0.3 to
-    0.9 m and 25 degrees to each side.
+    """Return points (125, 3) in the `stack` frame that span the viewers' range of movement. It reaches from 0.75 times
+    the nearest to 1.5 times the farthest viewpoint's distance, and 15 degrees farther to each side and 10 up and down:
+    by default from 0.3 to 0.9 m and 25 degrees to each side.
     """
     (near_m, far_m), (low_deg, high_deg) = viewing.viewing_m, viewing.viewing_up_deg
     side_deg = viewing.viewing_side_deg + 15
