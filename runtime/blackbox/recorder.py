@@ -126,19 +126,12 @@ class BlackBoxMessage(NamedTuple):
 
 
 class Recorder(logging.Handler):
-    """Records a run's samples, refreshes, states and log, from `watches` to `close`.
-
-    The observer methods are called on the presenter's thread. Any thread may log. Each file is written by a background
-    job.
+    """Records a run's samples, refreshes, states and log, from `watches` to `close`. The observer methods are called on
+    the presenter's thread. Any thread may log. Each file is written by a background job.
     """
 
     def __init__(self, folder: Path, *, minutes: float) -> None:
-        """Prepare the folder, and recover the journal if the last run was killed.
-
-        Args:
-            folder: Folder for the black box's files.
-            minutes: How much history to keep in memory. 0 means that no messages are kept or written.
-        """
+        """Prepare the folder, and recover the journal if the last run was killed. 0 minutes keep and write nothing."""
         super().__init__()
         self._folder, self._most_ns = folder, round(60 * minutes * NS_PER_S)
         self._kept_lock = threading.Lock()
@@ -166,12 +159,7 @@ class Recorder(logging.Handler):
         _sweep(folder)
 
     def watches(self, presenter: Presenter, *, in_stack_frame: bool) -> None:
-        """Start recording.
-
-        Args:
-            presenter: The run's presenter.
-            in_stack_frame: True if samples arrive in the `stack` frame. They are always recorded in the `sensor` frame.
-        """
+        """Start recording a presenter, always in the `sensor` frame, even if samples arrive in `stack`."""
         self._presenter = presenter
         if in_stack_frame:
             self._sensor_from_stack = np.asarray(np.linalg.inv(presenter.state.calibration.stack_from_sensor))
@@ -235,13 +223,8 @@ class Recorder(logging.Handler):
             self._fresh = min(self._fresh, len(self._kept))  # limits the memory used if the journal hangs
 
     def save(self, kind: str, saved: Saved = lambda problem, path: None) -> None:
-        """Write all kept messages to a file in the background, then call `saved`.
-
-        If several requests of the same kind arrive before their file has been started, they share one file.
-
-        Args:
-            kind: `asked` or the name of a fault, used in the file name.
-            saved: Function called with an error message (empty on success) and the file.
+        """Write all messages to a file named by `kind` in the background, then call `saved` with a problem or "", and
+        the file. Requests of the same kind that arrive before their file has been started share it.
         """
         if not self._most_ns or self._presenter is None:
             saved("the black box is switched off; set service.blackbox_minutes above 0", None)
@@ -330,11 +313,9 @@ def _head(presenter: Presenter) -> tuple[RecordingHeader, str]:
 
 
 def write_file(folder: Path, kind: str, kept: list[BlackBoxMessage], header: RecordingHeader, settings: str) -> Path:
-    """Write messages to a new file, atomically, and return its path.
-
-    The file can be read only by its owner, because it shows how viewers moved. The number in its name is higher than
-    any other in the folder, because dates may be wrong if the wall clock has been set back. Raises OSError if the file
-    cannot be written.
+    """Write messages to a new file, atomically, and return its path. Raises OSError if that fails. The file can be read
+    only by its owner, because it shows how viewers moved. The number in its name is higher than any other in the
+    folder, because dates may be wrong if the wall clock has been set back.
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = _next_name(folder, kind, datetime.now(UTC))
@@ -388,9 +369,8 @@ class _Written:
 
 
 class _Journal:
-    """A journal of the most recent messages on disk, which alternates between two files.
-
-    Each file holds at most half the time and half the bytes kept by the black box.
+    """A journal of the most recent messages on disk, which alternates between two files. Each file holds at most half
+    the time and half the bytes kept by the black box.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -423,11 +403,7 @@ class _Journal:
         return self._folder / f".{PREFIX}{JOURNAL}{self._current}{PART}"
 
     def close(self, *, in_use: bool = False) -> None:
-        """Delete the journal after the run has ended normally.
-
-        Args:
-            in_use: True if another thread is still writing. The current file is then not closed, but is deleted anyway.
-        """
+        """Delete the journal after the run has ended normally, without closing a file that is still `in_use`."""
         if self._file is not None and not in_use:
             with suppress(OSError):
                 self._file.close()
@@ -448,9 +424,8 @@ def _find_cut(folder: Path) -> None:
 
 
 def make_room(folder: Path) -> None:
-    """Delete files of the most common kind until at most `FILES_MAX` are left in the folder.
-
-    The newest file in the folder is kept. The first file of any kind is deleted only after all others of that kind.
+    """Delete files of the most common kind until at most `FILES_MAX` are left in the folder. The newest file in the
+    folder is kept. The first file of any kind is deleted only after all others of that kind.
     """
     kinds: dict[str, list[Path]] = {}
     *earlier, _ = sorted(folder.glob(f"{PREFIX}*.mcap"), key=lambda path: (_number(path), path.name)) or [folder]

@@ -30,10 +30,8 @@ class SeenEyes:
 
 @dataclass(eq=False)
 class BrowserLink:
-    """Passes data between the refresh loop and all pages that show the display.
-
-    The page that has been connected longest is the viewer: only its samples or camera pictures are used, and all other
-    pages just watch. Thread-safe.
+    """Passes data between the refresh loop and all pages that show the display. Thread-safe. The page that has been
+    connected longest is the viewer: only its samples or camera pictures are used, and all other pages just watch.
     """
 
     stack: PanelStack  # the stack being shown
@@ -59,15 +57,7 @@ class BrowserLink:
         return next(iter(self.news), None) is page
 
     def see(self, eyes_m: Any, page_ms: float) -> None:
-        """Add a sample of eye positions.
-
-        Args:
-            eyes_m: Eyes in the `stack` frame, shape (2, 3), or None if there is no viewer.
-            page_ms: The sample's time on the page's clock.
-
-        Raises:
-            ValueError: The sample is not a pair of eyes in front of the front panel.
-        """
+        """Add eyes (2, 3) in `stack`, or None. Raises ValueError if they are not in front of the front panel."""
         eyes = None
         if eyes_m is not None:
             eyes = np.array(eyes_m, np.float64)
@@ -78,13 +68,7 @@ class BrowserLink:
             self._arrived.notify()
 
     def seen(self, timeout_s: float) -> list[SeenEyes]:
-        """Remove all unread samples from the queue and return them, oldest first.
-
-        If there are none, wait for one.
-
-        Args:
-            timeout_s: How long to wait at most, in seconds. If no sample arrives, the result is empty.
-        """
+        """Take all unread samples, oldest first. If there are none, wait for one for at most `timeout_s`."""
         with self._arrived:
             if not self._samples:
                 self._arrived.wait(timeout_s)
@@ -93,24 +77,13 @@ class BrowserLink:
         return samples
 
     def send_picture(self, coded: bytes, page_ms: float) -> None:
-        """Store a camera picture in place of the previous one, even if that one has not been read.
-
-        Args:
-            coded: The encoded picture.
-            page_ms: The picture's time on the page's clock.
-        """
+        """Store an encoded camera picture in place of the previous one, even if that one has not been read."""
         with self._arrived:
             self._picture = coded, page_ms
             self._arrived.notify()
 
     def picture(self, timeout_s: float) -> tuple[bytes, float] | None:
-        """Return the unread camera picture and its time on the page's clock, and forget the picture.
-
-        If there is none, wait for one.
-
-        Args:
-            timeout_s: How long to wait at most, in seconds. If no picture arrives, the result is None.
-        """
+        """Take the unread camera picture and its `page_ms`, or None if none arrives within `timeout_s`."""
         with self._arrived:
             if self._picture is None:
                 self._arrived.wait(timeout_s)
@@ -118,11 +91,7 @@ class BrowserLink:
         return taken
 
     def reporting(self, finder: Any) -> Callable[[SensorFrame], EyePoints | None]:
-        """Wrap an eye finder in a function that also sends the results to all pages.
-
-        Args:
-            finder: Eye finder for pictures from a page's camera.
-        """
+        """Wrap an eye finder in a function that also sends the results to all pages."""
 
         def find(frame: SensorFrame) -> EyePoints | None:
             eyes: EyePoints | None = finder.find(frame)
@@ -145,18 +114,11 @@ class BrowserLink:
         self._captures.append((capture_ns, page_ms))
 
     def page_ms_of(self, capture_ns: int) -> float | None:
-        """Return the page time of the latest sample captured at or before `capture_ns`.
-
-        This is a time on the page's clock. Returns None if no such sample is stored.
-        """
+        """Return the page's time of the latest sample captured at or before `capture_ns`, or None."""
         return next((page_ms for ns, page_ms in reversed(tuple(self._captures)) if ns <= capture_ns), None)
 
     def refreshed(self, account: dict[str, Any]) -> None:
-        """Publish the latest frame and its refresh to all pages.
-
-        Args:
-            account: The refresh's status, for pages to show.
-        """
+        """Publish the latest frame and its refresh's status to all pages."""
         self.shown = self.frame, account
         self._notify()
 

@@ -51,20 +51,11 @@ def viewer_html(
     relief: F32 | None = None,
     follows: bool = True,
 ) -> str:
-    """Return the HTML of a viewer page for one solution.
+    """Return the HTML of a viewer page for one solution, with each eye's target picture, if any, and its relief (h, w).
 
     The layers are stored losslessly if they fit into `LAYERS_BYTES`. If not, they are stored as AVIF, and the page
-    states their PSNR.
-
-    Args:
-        layers: Layers, rear to front, shape (N, h, w, 3 or 4).
-        wanted: Each eye's target picture (h, w, 3), compressed so that it fits into the rest of the page. If empty, the
-            page has no target pictures.
-        eyes_m: Eyes that the layers were solved for, shape (2, 3), in the `stack` frame.
-        fov_deg: The target pictures' horizontal field of view.
-        text: The page's title, followed by lines of text to show below the controls.
-        relief: The content's relief (`optics.relief`), shape (h, w), or None if it is unknown.
-        follows: True to align the outer panels to the viewer's head until the user switches this off.
+    states their PSNR. `text` is the page's title, then lines below the controls. If `follows`, the outer panels are
+    aligned to the viewer's head until the user switches this off.
     """
     title, *lines = text
     scene = {"stack": stack_table(stack), "eyes_m": eyes_m, "fov_deg": fov_deg, "title": title, "follows": follows}
@@ -112,26 +103,15 @@ def _script() -> str:
 
 
 def _exact(layer: U8, *, quick: bool) -> str:
-    """Encode a layer losslessly as a data URL.
-
-    The format is WebP if possible, because a WebP file is a third smaller than a PNG file, which makes up for the space
-    added by base64.
-    """
+    """Encode a layer losslessly as a data URL: WebP if possible, because it is a third smaller than PNG."""
     if max(layer.shape) > WEBP_MAX_PX:
         return _url(layer, "png")
     return _url(layer, "webp", **({"method": 0} if quick else {}))
 
 
 def _stored(pictures: Sequence[U8], room: int, *, qualities: Sequence[int] = QUALITIES) -> tuple[list[str], float]:
-    """Encode pictures as AVIF, using the first quality that lets them fit into `room` bytes.
-
-    Args:
-        pictures: Pictures, shape (h, w, 3 or 4).
-        room: Maximum total size in bytes. If the pictures do not fit at any quality, the last one is used.
-        qualities: AVIF qualities in descending order.
-
-    Returns:
-        The pictures as data URLs, and their mean squared error after compression.
+    """Encode pictures as AVIF data URLs, by the first of descending qualities, or the last, that fits `room` bytes.
+    Also return their mean squared error after compression.
     """
     urls: list[str] = []
     for quality in qualities:

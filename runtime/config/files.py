@@ -12,25 +12,15 @@ from runtime.support.sections import Section, read_table, validated
 
 
 def load_settings(path: Path | None) -> Settings:
-    """Read settings from a file, or return the defaults if `path` is None.
-
-    Raises InputError if the file cannot be read or contains an invalid setting.
-    """
+    """Read settings from a file, or return the defaults. Raises InputError for the file or a setting."""
     if path is None:
         return Settings()
     return validated(Settings, read_table(path), source=path, folder=path.absolute().parent)
 
 
 def load_stack(path: Path, *, width_px: int, height_px: int) -> PanelStack:
-    """Read the stack's geometry from a file given with `--panels`.
-
-    Args:
-        path: TOML or JSON file.
-        width_px: The panels' width in pixels, used if the file does not give one.
-        height_px: The panels' height in pixels, used if the file does not give one.
-
-    Raises:
-        InputError: The file cannot be read, a field is missing or a value is invalid.
+    """Read the stack's geometry from a file given with `--panels`, with these numbers of pixels if it gives none.
+    Raises InputError if the file cannot be read, a field is missing or a value is invalid.
     """
     table = {"width_px": width_px, "height_px": height_px} | read_table(path)
     for name in ("width_m", "height_m", "x_m"):
@@ -53,10 +43,8 @@ def with_options(
     model: str | None = None,
     backend: str | None = None,
 ) -> Settings:
-    """Return the settings with command-line options applied.
-
-    Any option that is None or False changes nothing. With `loop`, the recording starts again when it ends. If a value
-    is invalid, raises InputError with the option's name.
+    """Return the settings with command-line options other than None and False applied; `loop` repeats the recording.
+    Raises InputError, which names the option, if a value is invalid.
     """
     overrides: tuple[tuple[str, str, dict[str, Any] | None], ...] = (
         ("--replay", "sensor", None if replay is None else {"driver": "replay", "source": replay}),
@@ -74,10 +62,7 @@ def with_options(
 
 
 def changed(settings: Settings, section: str, values: dict[str, Any], *, source: str) -> Settings:
-    """Return the settings with some values in one section replaced.
-
-    If a value is invalid, raises InputError with `source` as its origin.
-    """
+    """Return the settings with values in one section replaced. Raises InputError, which names `source`."""
     old: Section = getattr(settings, section)
     new = validated(type(old), old.model_dump() | values, source=source)
     return settings.model_copy(update={section: new})

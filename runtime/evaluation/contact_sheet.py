@@ -27,10 +27,7 @@ PAPER = 246  # background grey level
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """A measured refresh from a run, with the pictures for the contact sheet and the viewer page.
-
-    The contact sheet shows the layers after alignment; the viewer page shows the solution before alignment.
-    """
+    """A measured refresh from a run, with aligned layers for the contact sheet and the solution for the viewer page."""
 
     layers: U8  # (N, h, w, 3 or 4) layers as shown by the panels, after alignment
     eye_views: EyeViews
@@ -45,14 +42,8 @@ class Moment:
 
 
 def contact_sheet(layers: U8, eye_views: EyeViews | None, *, headline: str, lines: Sequence[str] = ()) -> U8:
-    """Draw a contact sheet, and return it as an RGB picture, shape (h, w, 3).
-
-    The first row shows the layers. It is followed by a row for each eye, with the target, the retina image and the
-    error.
-
-    Args:
-        eye_views: Retina images and targets, or None to leave out the eyes' rows.
-        lines: Lines of text below the headline. Long lines are wrapped.
+    """Draw a contact sheet (h, w, 3): a row of layers, then for each eye, if given, target, retina image and error.
+    Long lines of text are wrapped.
     """
     height, width = layers.shape[1:3]
     tile = (TILE_WIDTH, round(TILE_WIDTH * height / width))
@@ -91,11 +82,7 @@ def contact_sheet(layers: U8, eye_views: EyeViews | None, *, headline: str, line
 
 
 def headline(light_db: float | None) -> str:
-    """Return a contact sheet's headline, which states the light PSNR and the conditions it applies to.
-
-    Args:
-        light_db: Light PSNR for a tracking error of 1 mm, or None or NaN if it was not measured.
-    """
+    """Return a headline with the light PSNR for a tracking error of 1 mm, None or NaN if it was not measured."""
     if light_db is None or math.isnan(light_db):
         return "light PSNR at these eyes was not measured"
     conditions = f"pixels as squares, pupil {PUPIL_MM:g} mm, tracking error {TRACKING_SIGMA_MM:g} mm"

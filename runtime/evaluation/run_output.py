@@ -36,11 +36,7 @@ class RunOutput:
     """
 
     def __init__(self, target: Path, *, every_one: bool = True) -> None:
-        """Create a writer, which must be entered as a context manager before use.
-
-        Args:
-            every_one: Wait for a slow disk. If False, drop lines and pictures that the disk is too slow for.
-        """
+        """Create a writer, to be entered before use, that waits for a slow disk if `every_one`, or else drops files."""
         self._folder = OutputFolder(target)
         self._target, self._every_one = target, every_one
         self._lines: TextIO | None = None
@@ -90,12 +86,7 @@ class RunOutput:
         self._later(lambda: self._line(line))
 
     def light(self, frame: int, *, layers: U8) -> None:
-        """Queue a refresh's layers for the folder `light/<frame>/`.
-
-        Args:
-            layers: Layers as shown by the panels, shape (N, h, w, 3 or 4). The caller must not modify the array
-                afterwards.
-        """
+        """Queue a refresh's layers as shown, not to be modified afterwards, for the folder `light/<frame>/`."""
 
         def write() -> None:
             for n, layer in enumerate(layers):
@@ -106,10 +97,7 @@ class RunOutput:
     def light_targets(
         self, frame: int, *, info: Mapping[str, Any], drawn: Pictures | None, true: Pictures | None
     ) -> None:
-        """Queue a refresh's light.json and target pictures for the folder `light/<frame>/`.
-
-        The caller must not modify the pictures afterwards.
-        """
+        """Queue light.json and target pictures, not to be modified afterwards, for the folder `light/<frame>/`."""
 
         def write() -> None:
             for name, pictures in (("drawn", drawn), ("true", true)):
@@ -131,12 +119,8 @@ class RunOutput:
     def finish(
         self, summary: dict[str, Any], layers: U8 | None, moment: Moment | None = None, *, unseen: str = ""
     ) -> None:
-        """Queue the files to be written at the end of a run. After a disk failure, write only summary.json.
-
-        Args:
-            layers: The last refresh's layers, shape (N, h, w, 3 or 4). None: write only summary.json.
-            moment: Last measured refresh, used for the contact sheet, the eye views and the viewer page.
-            unseen: Viewer page to write if no refresh was measured.
+        """Queue the files at the end of a run, or only summary.json after a disk failure or without layers. The contact
+        sheet and the eyes' views show `moment`. Without it, the viewer page is `unseen`.
         """
 
         def write() -> None:
@@ -168,11 +152,7 @@ class RunOutput:
             self._pictures.release()
 
     def _later(self, work: Work, *, then: Work = lambda: None) -> bool:
-        """Queue a job and return True, or return False if the job was dropped.
-
-        Args:
-            then: Cleanup that runs after the job, even if the job failed or was skipped.
-        """
+        """Queue a job, unless it was dropped (False). `then` cleans up even if the job failed or was skipped."""
         if self.problem:
             return False
         try:

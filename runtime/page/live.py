@@ -24,13 +24,7 @@ RANGES |= {"gap_mm": (1.0, 500.0), "camera": (0.0, 1.0)}  # changing either of t
 
 
 async def live(socket: WebSocket, link: BrowserLink, *, protocol: str | None) -> None:
-    """Serve an authorised page until it disconnects.
-
-    Args:
-        socket: WebSocket, not accepted yet.
-        link: Link to the refresh loop.
-        protocol: WebSocket subprotocol to confirm, or None if the page did not offer it.
-    """
+    """Serve an authorised page on a socket not accepted yet, with any subprotocol it offered, until it disconnects."""
     if len(link.news) >= PAGES_MAX:
         await socket.close(1013, "too many pages are open")
         return
@@ -59,10 +53,7 @@ def _tell(loop: asyncio.AbstractEventLoop, news: asyncio.Event) -> None:
 
 
 class _Page:
-    """Sends data to one page and receives its messages.
-
-    New layers are sent only after the page has drawn the previous ones.
-    """
+    """Sends data to one page, new layers only after it has drawn the previous ones, and receives its messages."""
 
     def __init__(self, socket: WebSocket, link: BrowserLink) -> None:
         self._socket, self._link = socket, link
@@ -100,14 +91,7 @@ class _Page:
             self.news.clear()
 
     async def _send_layers(self, kind: str, layers: U8, relief: F32 | None, solved_for_m: Any) -> None:
-        """Send RGBA layers and, if their content's relief is known, the relief as 16-bit floats.
-
-        Args:
-            kind: `solved` for a solution, or `flat` for the flat picture.
-            layers: Layers, shape (N, h, w, 4).
-            relief: The content's relief, shape (h, w).
-            solved_for_m: Eyes that the layers were solved for, shape (2, 3), in the `stack` frame.
-        """
+        """Send RGBA layers (N, h, w, 4) of `kind` `solved` or `flat` and, if known, relief (h, w) as 16-bit floats."""
         data = await asyncio.to_thread(lambda: layers.tobytes() + (b"" if relief is None else half_floats(relief)))
         message = {"layers": kind, "solved_for_m": solved_for_m, "size": layers.shape[2:0:-1]}
         await self._say(message if relief is None else message | {"relief": relief.shape[::-1]})

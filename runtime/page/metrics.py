@@ -12,9 +12,8 @@ TEXTS = ("state", "effort", "model", "scene")
 
 
 def exposition(status: Mapping[str, Any]) -> str:
-    """Format a status's numbers and known texts in the Prometheus text format.
-
-    Quantiles, table entries and texts become labels. Null values are skipped.
+    """Format a status's numbers and known texts in the Prometheus text format. Quantiles, table entries and texts
+    become labels. Null values are skipped.
     """
     return "".join(f"{line}\n" for line in _lines(status))
 
@@ -36,10 +35,7 @@ def _lines(status: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _key(field: str, key: str) -> str:
-    """Return the label for an entry of one of the status's dictionaries.
-
-    The key `p95` stands for quantile 0.95, and `max` for quantile 1.
-    """
+    """Return the label for an entry of a status's dictionary: `p95` is quantile 0.95, and `max` quantile 1."""
     if field in TABLES:
         return _label(TABLES[field], key)
     if key[:1] == "p" and key[1:].isdigit():

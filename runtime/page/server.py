@@ -62,12 +62,8 @@ class TooLong(ValueError):
 
 
 def application(daemon: DaemonClient, token: str, *, link: BrowserLink | None = None) -> Starlette:
-    """Create the web application. Its server must listen only on loopback.
-
-    Args:
-        daemon: Client for talking to the daemon.
-        token: Token required in every request.
-        link: Link to the refresh loop if the page is itself the display. None to serve only the operator's page.
+    """Create the web application, whose server must listen only on loopback, and whose requests need the token. `link`
+    leads to the refresh loop if the page is itself the display.
     """
 
     def permitted(request: HTTPConnection) -> bool:
@@ -151,12 +147,7 @@ async def _guard(request: Request, handler: Handler) -> Response:
 
 
 async def _body(request: Request) -> bytes:
-    """Return a request's body.
-
-    Raises:
-        TooLong: The body is longer than `REQUEST_MAX_BYTES`.
-        ValueError: The client disconnects, or the body does not arrive within `REQUEST_S`.
-    """
+    """Return a request's body. Raises TooLong, or ValueError if it does not arrive within `REQUEST_S`."""
     received = b""
     try:
         async with asyncio.timeout(REQUEST_S):

@@ -17,10 +17,8 @@ MOST_BYTES = 4096  # maximum number of bytes read from the file
 
 
 def token_of(path: Path) -> str:
-    """Read the token from a file. If the file does not exist, create it with a new token.
-
-    Raises:
-        InputError: The file cannot be created or read, other users can access it, or it does not contain a valid token.
+    """Read the token from a file, or create it. Raises InputError if that fails, others can access it, or it is
+    invalid.
     """
     token, name = secrets.token_urlsafe(TOKEN_BYTES), ""
     try:

@@ -39,10 +39,7 @@ OWN = Own()
 
 
 class GrowingPage:
-    """A report that rewrites index.html, report.json and the plots after every new result.
-
-    A report that is stopped early is still usable, because its files contain all results obtained so far.
-    """
+    """A report that rewrites its page, report.json and plots after every result, so it can be stopped early."""
 
     def __init__(self, out: Path, command: str, progress: Progress) -> None:
         self.out, self._command, self._progress = out, command, progress
@@ -93,23 +90,12 @@ def whole_report(
     command: str = "phasestack report",
     progress: Progress = lambda name: None,
 ) -> dict[str, Any]:
-    """Run all measurements, write the results to a folder and return the contents of report.json.
+    """Run all measurements, write page, plots and report.json to a folder, and return the contents of the latter.
 
-    Case files and models are checked before the first measurement.
-
-    Args:
-        out: Folder for the page, the plots and report.json.
-        pairs: Folder with case files. They are measured before the built-in scenes.
-        own: What else is done with the case files.
-        with_focal: Also measure focal parallax.
-        models: Names or ONNX files of models to measure in addition to the shipped ones.
-        quick: Draw built-in scenes with a quarter of the pixels, omit the slowest reference, and use shorter motions.
-        command: Command that reproduces the report, shown on the page.
-        progress: Function called with the name of each step.
-
-    Raises:
-        InputError: A case file or a model is invalid, or the results cannot be written.
-        FatalError: A measuring process failed.
+    Case files in `pairs`, and models, are checked before the first measurement; `own` says what else is done with them,
+    and `models` are measured in addition to the shipped ones. `quick` draws built-in scenes with a quarter of the
+    pixels, omits the slowest reference and shortens motions. Raises InputError for a case file or a model, or if
+    results cannot be written, and FatalError if a measuring process failed.
     """
     cases = read_pairs(pairs) if pairs is not None else []
     stack = StackGeometry().stack()
@@ -133,9 +119,8 @@ def whole_report(
 
 
 def _refuse_unsuitable(methods: Sequence[Method], cases: Sequence[StillPair], stacks: Sequence[PanelStack]) -> None:
-    """Load every method for every stack now, so that none is refused after minutes of measuring.
-
-    Raises InputError if a method cannot serve a stack. The message names the first case file with that stack.
+    """Load every method for every stack now. Raises InputError, which names the first case file, if one does not serve
+    it.
     """
     for stack in dict.fromkeys([*(pair.stack for pair in cases), *stacks]):
         for method in methods:

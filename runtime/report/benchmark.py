@@ -85,10 +85,7 @@ def yardstick_ms() -> float:
 
 
 def scatter(values: Sequence[float]) -> float:
-    """Return the relative standard error of the median.
-
-    The error is estimated as 1.4826·MAD·1.2533/sqrt(n), divided by the median.
-    """
+    """Return the relative standard error of the median, 1.4826·MAD·1.2533/sqrt(n) over the median."""
     middle = float(np.median(values))
     deviation = float(np.median(np.abs(np.asarray(values) - middle)))
     relative: float = 1.4826 * 1.2533 * deviation / middle / len(values) ** 0.5
@@ -101,13 +98,7 @@ def measured(
     sizes: Sequence[tuple[int, int]] = SIZES,
     progress: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Any]:
-    """Measure the shipped models and return the contents of a regression file. This takes about a minute.
-
-    Args:
-        models: Model names.
-        sizes: Panel widths and heights, in pixels.
-        progress: Function called after each measurement with the measurement's name.
-    """
+    """Measure the shipped models on panels of these sizes, and return a regression file's contents. Takes a minute."""
     yardsticks, entries = [yardstick_ms()], []
     methods = [Method(name, "network", name) for name in models]
     for width, height in sizes:
@@ -143,10 +134,9 @@ class Change:
 
 
 def compare(old: RegressionFile, new: RegressionFile) -> list[Change]:
-    """Return the changes between two regression files that exceed the noise.
-
-    Times are divided by their file's yardstick before the comparison. They are not compared if the machine was too busy
-    during either measurement (`too_busy`).
+    """Return the changes between two regression files that exceed the noise. Times are divided by their file's
+    yardstick before the comparison. They are not compared if the machine was too busy during either measurement
+    (`too_busy`).
     """
     later = {entry.title: entry for entry in new.methods}
     machine = new.yardstick_ms / old.yardstick_ms

@@ -141,20 +141,17 @@ class Patches:
 
 
 def uniformity(falloff: float) -> float:
-    """Return the lowest of nine points' luminances, divided by the highest.
-
-    The points lie at 10, 50 and 90 % of the width and the height. Luminance falls with the square of the distance from
-    the middle, by `falloff` in the corners (`Lighting`).
+    """Return the lowest of nine points' luminances, divided by the highest. The points lie at 10, 50 and 90 % of the
+    width and the height. Luminance falls with the square of the distance from the middle, by `falloff` in the corners
+    (`Lighting`).
     """
     lights = [1 - falloff * 2 * (y * y + z * z) for y in (-0.4, 0.0, 0.4) for z in (-0.4, 0.0, 0.4)]
     return min(lights) / max(lights)
 
 
 def freedom_without_tracking(pair: StillPair, layers: U8) -> dict[str, Any]:
-    """Measure light while the head moves but the layers stay.
-
-    Returns:
-        For each direction, `mm` and `light_db` (lists), and `falls_3_db_at_mm`, or None if it does not fall as far.
+    """Measure light while the head moves but the layers stay. For each direction: lists `mm` and `light_db`, and
+    `falls_3_db_at_mm`, or None if it does not fall as far.
     """
     height, width = pair.images[0].shape[:2]
     sampling = LIGHT._replace(step=max(1, math.ceil(math.sqrt(height * width / 20_000))))
@@ -186,15 +183,7 @@ PLACES = ((0.4, 0.0), (0.6, 0.0), (0.9, 0.0), (1.2, 0.0), (0.6, 20.0), (0.6, 40.
 def freedom_with_tracking(
     stack: PanelStack, scene: str, solve: Callable[[StillPair], float]
 ) -> Iterator[dict[str, float]]:
-    """Measure light where the layers are solved for each place of the head.
-
-    Args:
-        scene: Built-in scene.
-        solve: Function that returns a pair's light in dB.
-
-    Yields:
-        `distance_m`, `angle_deg` and `light_db` of each place (`PLACES`).
-    """
+    """Yield `distance_m`, `angle_deg` and `light_db` of `PLACES` of the head, solved for each by `solve`."""
     small = reduced(stack)
     with PairPainter(scene, replace(small)) as painter:
         for distance_m, angle_deg in PLACES:

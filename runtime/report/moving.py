@@ -49,17 +49,9 @@ def simulated_run(
     keep_light: int = 0,
     output: Output | None = None,
 ) -> dict[str, Any]:
-    """Run against a simulated clock, measure live quality, and return the contents of summary.json.
-
-    Args:
-        settings: Run settings, with a recording as the sensor.
-        scale: Factor for the panels' number of rows and columns.
-        fixed: Effort for every solution if the setting `model.effort` is `full`. None: all of the model's steps.
-        keep_light: Keep the layers from every `keep_light`-th refresh. 0: keep no layers.
-        output: Destination for the kept layers and the refreshes' records.
-
-    Raises:
-        FatalError: The settings or their files cannot be used.
+    """Run against a simulated clock with a recording, measure live quality, and return the contents of summary.json.
+    `scale` multiplies the panels' rows and columns; `fixed` is the effort if `model.effort` is `full`, by default all
+    steps. The layers of every `keep_light`-th refresh, and the refreshes' records, go to `output`. Raises FatalError.
     """
     options = RunOptions(max_speed=True, measure=True, scale=scale, fixed=fixed, keep_light=keep_light)
     with ExitStack() as cleanup:
@@ -71,13 +63,7 @@ def simulated_run(
 
 
 def settings_for(recording: Path, *, scene: str, effort: str) -> Settings:
-    """Return the default settings for a simulated run, with the stage times of COSTS_MS.
-
-    Args:
-        recording: Recording of the viewer's motion.
-        scene: Name of the scene to show.
-        effort: Value for the setting `model.effort`: `full` or `auto`.
-    """
+    """Return settings for a simulated run of a recording, with the stage times of COSTS_MS."""
     table = Settings().model_dump()
     table["sensor"] |= {"driver": "replay", "source": str(recording), "loop": False}
     table["content"]["scene"] = scene
@@ -90,17 +76,8 @@ def settings_for(recording: Path, *, scene: str, effort: str) -> Settings:
 def moving_run(
     motion: str, effort: Effort | None, *, seconds: float = SECONDS, scale: float = 0.5, seed: int = SEED
 ) -> Moving:
-    """Simulate one motion by the viewer, and measure what the viewer sees.
-
-    Args:
-        motion: Key in SCENES. In `film`, the content moves and the head is at rest.
-        effort: Effort for every solution, or None to let the runtime choose.
-        seconds: Duration of the motion.
-        scale: Factor for the panels' number of rows and columns.
-        seed: Seed for the path and the sensor noise.
-
-    Raises:
-        FatalError: The run yields no measurement.
+    """Simulate a motion of SCENES by the viewer, or moving content in `film`, and measure what the viewer sees. Without
+    an effort, the runtime chooses. `scale` multiplies rows and columns. Raises FatalError without a measurement.
     """
     with tempfile.TemporaryDirectory(prefix="phasestack-") as folder:
         recording = Path(folder) / "motion.mcap"

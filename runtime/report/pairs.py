@@ -71,10 +71,7 @@ class CaseFile(BaseModel):
 
 
 def read_pairs(folder: Path) -> list[StillPair]:
-    """Read all case files in a folder, in order of name. Other JSON files are ignored.
-
-    Raises InputError if a case file is invalid or the folder contains no case file.
-    """
+    """Read all case files in a folder, by name, no other JSON. Raises InputError for invalid or no cases."""
     if not folder.is_dir():
         raise InputError(folder, "", "is not a folder")
     pairs = []
@@ -120,14 +117,7 @@ def _case(path: Path, table: dict[str, Any]) -> StillPair:
 
 
 def eyes_at(*, distance_m: float, angle_deg: float = 0.0, height_m: float = 0.0, ipd_m: float = 0.063) -> F64:
-    """Return the left and right eyes of a viewer facing the origin, in the `stack` frame, shape (2, 3).
-
-    Args:
-        distance_m: Distance from the origin to the midpoint between the eyes.
-        angle_deg: The midpoint's angle from the x axis towards +y.
-        height_m: The midpoint's height above the origin.
-        ipd_m: Distance between the eyes.
-    """
+    """Return the (2, 3) eyes in `stack` of a viewer facing the origin, `angle_deg` from the x axis towards +y."""
     angle = math.radians(angle_deg)
     level = math.sqrt(max(distance_m**2 - height_m**2, 0.0))
     middle = np.array([level * math.cos(angle), level * math.sin(angle), height_m])
@@ -136,28 +126,17 @@ def eyes_at(*, distance_m: float, angle_deg: float = 0.0, height_m: float = 0.0,
 
 
 def beside(eye_m: ArrayLike, mm: float) -> list[F64]:
-    """Return positions to the right of, above, to the left of and below an eye, in the `stack` frame.
-
-    Args:
-        eye_m: The eye's position, shape (3,), in the `stack` frame. The directions are the axes of the eye's pose.
-        mm: Distance from the eye to each returned position, in mm.
-    """
+    """Return positions in `stack`, in mm along the axes of the eye's pose, to its right, above, left and below."""
     pose = stack_from_eye(eye_m)
     directions = ((1, 0), (0, 1), (-1, 0), (0, -1))
     return [pose[:3, 3] + mm / 1000 * (right * pose[:3, 0] + up * pose[:3, 1]) for right, up in directions]
 
 
 class PairPainter:
-    """Painter that draws a scene as seen from any position.
-
-    The painter owns an OpenGL context. Use it as a context manager, and on one thread only.
-    """
+    """Painter of a scene as seen from any position: a context manager, on one thread, with an OpenGL context."""
 
     def __init__(self, scene: str | Scene, stack: PanelStack) -> None:
-        """Open a scene, given as an object or by the name of a built-in scene, for a stack's panels.
-
-        Raises MissingPart if OpenGL or its Python package is not installed.
-        """
+        """Open a scene, or a built-in scene by name, for a stack's panels. Raises MissingPart without OpenGL."""
         from runtime.content.procedural import ProceduralSource
         from runtime.support.gl import offscreen_context
 
@@ -172,12 +151,7 @@ class PairPainter:
         self.context.release()
 
     def draw(self, eye_m: ArrayLike, pixels_from_stack: F64, *, width_px: int, height_px: int) -> U8:
-        """Draw the scene through any projection, and return the picture, shape (h, w, 4).
-
-        Args:
-            eye_m: The eye's position, shape (3,), in the `stack` frame.
-            pixels_from_stack: 3x4 projection from points in the `stack` frame to the picture's pixels.
-        """
+        """Draw the scene (h, w, 4) through any 3x4 projection from `stack` to the picture's pixels."""
         from runtime.content.base import View
 
         eye = np.asarray(eye_m, dtype=np.float64)
@@ -189,13 +163,7 @@ class PairPainter:
         return np.ascontiguousarray(self.draw(eye_m, projection, width_px=width_px, height_px=height_px)[..., :3])
 
     def pair(self, name: str, eyes_m: Eyes, *, fov_deg: float = FOV_DEG, off_mm: Sequence[float] = OFF_MM) -> StillPair:
-        """Draw a pair at the panels' resolution, with targets for displaced eyes.
-
-        Args:
-            name: Pair name.
-            fov_deg: The pictures' horizontal field of view.
-            off_mm: Displacements. For each displacement, both eyes are moved right, up, left and down.
-        """
+        """Draw a pair at the panels' resolution, and targets for eyes moved right, up, left and down by `off_mm`."""
         size = {"width_px": self.stack.width_px, "height_px": self.stack.height_px}
         left, right = (self.image(eye, **size, fov_deg=fov_deg) for eye in eyes_m)
         off = tuple(

@@ -115,10 +115,8 @@ def ideal_error(pair: StillPair, layers: U8) -> float:
 
 
 class Bench:
-    """Measures imperfections on one or more solved pairs.
-
-    Each figure is the ideal panels' light plus the error that the imperfection adds. Both terms of the added error use
-    the same rays, so that a few thousand pixels suffice.
+    """Measures imperfections on solved pairs: the ideal panels' light plus the error that each adds. Both terms of the
+    added error use the same rays, so that a few thousand pixels suffice.
     """
 
     def __init__(self, subjects: Sequence[Subject]) -> None:
@@ -237,12 +235,8 @@ def _filters(choice: float, stack: PanelStack) -> RealPanels:
 
 
 def cell_choice(choice: float, count: int) -> RealPanels:
-    """Return panels with a kind of cell.
-
-    Args:
-        choice: 0: rotators; 1: retarders between quarter-wave films; 2: twisted nematic cells; 3: half-wave plates;
-            4: half-wave plates with every other panel inverted and the analyser turned to match.
-        count: Number of panels.
+    """Return panels of rotators (0), retarders between quarter-wave films (1), twisted nematic cells (2), half-wave
+    plates (3), or those with every other panel inverted and the analyser turned to match (4).
     """
     if choice == 4:
         plates = tuple(Cell("half-wave", inverted=n % 2 == 1) for n in range(count))

@@ -19,13 +19,7 @@ HALF_TURN = Rotation.from_quat([1, 2, 2, 0]).as_matrix()
 
 
 def cloud(*, aspect: float = 1.0, size_m: float = 0.3, count: int = 27) -> F64:
-    """Return random points in a box around the origin, shape (count, 3).
-
-    Args:
-        aspect: The box's extents along y and z, relative to its extent along x.
-        size_m: Half the box's extent along x.
-        count: Number of points.
-    """
+    """Return random points (count, 3) in a box, `size_m` half its extent along x; y and z are `aspect` times that."""
     return np.random.default_rng(11).uniform(-1, 1, (count, 3)) * [size_m, size_m * aspect, size_m * aspect]
 
 
@@ -37,17 +31,9 @@ def fitted(
     offset_m: tuple[float, float, float] = (0.1, -0.4, 0.3),
     turn: F64 = TURN,
 ) -> Answer:
-    """Transform points by a known similarity, and compare the fitted similarity with the known one.
-
-    The condition number is the points' largest coordinate divided by their RMS extent along the second principal axis,
-    in whichever frame is worse. Relative errors in the coordinates, including rounding, rotate the fit by this factor.
-
-    Args:
-        fit: Solver to test.
-        sensor_m: Points before transformation, shape (K, 3).
-        scale: The known similarity's scale.
-        offset_m: The known similarity's translation.
-        turn: The known similarity's 3x3 rotation.
+    """Transform points (K, 3) by a known similarity, and compare the fitted similarity with the known one. The
+    condition number is the points' largest coordinate divided by their RMS extent along the second principal axis, in
+    whichever frame is worse. Relative errors in the coordinates, including rounding, rotate the fit by this factor.
     """
     stack_m = scale * sensor_m @ turn.T + offset_m
     matrix = fit(sensor_m, stack_m)
@@ -65,11 +51,7 @@ def fitted(
 
 
 def trials(fits: Mapping[str, Fit]) -> Iterator[Trial]:
-    """Yield all trials for calibration.
-
-    Args:
-        fits: Solvers, keyed by method name. Only `least-squares` is tested on the extreme cases.
-    """
+    """Yield all trials for calibration, of which only `least-squares` is tested on the extreme cases."""
     for rule, solver in fits.items():
         yield Trial(STAGE, f"{rule}: a usual cloud", partial(fitted, solver, cloud()), measure="rad")
     fit = partial(fitted, fits["least-squares"])

@@ -45,9 +45,8 @@ def farthest(values: Any, reference: Any) -> float:
 
 
 def axes(eye: Any) -> Any:
-    """Return an eye pose's right, up and back axes as rows, in extended precision ((10)-(13)).
-
-    For an eye on the vertical axis, the result is the limit when approached from +x.
+    """Return an eye pose's right, up and back axes as rows, in extended precision ((10)-(13)). For an eye on the
+    vertical axis, the result is the limit when approached from +x.
     """
     back = eye / np.abs(eye).max()
     back = back / np.sqrt(back @ back)
@@ -76,10 +75,7 @@ def panel_position(eye: Any, image: Any, stack: PanelStack, index: int) -> Any:
 
 
 def pose(eye: Sequence[float]) -> Answer:
-    """Compare an eye pose's rotation with the reference.
-
-    The condition number grows as the eye approaches the vertical axis.
-    """
+    """Compare an eye pose's rotation, whose condition grows near the vertical axis, with the reference."""
     error = farthest(stack_from_eye(eye)[:3, :3].T, axes(extended(eye)))
     scale = max(map(abs, eye))
     ground = math.hypot(eye[0] / scale, eye[1] / scale)
@@ -109,10 +105,9 @@ def scale_shift(eye: Sequence[float], to_x_m: float) -> Answer:
 
 
 def followed(eye: Sequence[float], *, index: int = 2, stack: PanelStack = STACK) -> Answer:
-    """Compare the homography M_RPU (47) with ray tracing, at image positions whose rays cross the panel.
-
-    The condition number says how fast the position on the panel changes, in panel widths, for relative changes in the
-    image position or the eye's position.
+    """Compare the homography M_RPU (47) with ray tracing, at image positions whose rays cross the panel. The condition
+    number says how fast the position on the panel changes, in panel widths, for relative changes in the image position
+    or the eye's position.
     """
     view: Any = {"width_px": stack.width_px, "height_px": stack.height_px, "fov_deg": FOV_DEG}
     m = panel_from_image(image_from_stack(eye, **view), stack.panel(index))
@@ -131,10 +126,7 @@ def followed(eye: Sequence[float], *, index: int = 2, stack: PanelStack = STACK)
 
 
 def of_intensity(intensity: float, branch: Literal[1, 2]) -> Answer:
-    """Compare the phase computed from an intensity with the reference.
-
-    The condition number goes to infinity as the intensity approaches 1.
-    """
+    """Compare the phase of an intensity, infinitely ill-conditioned near 1, with the reference."""
     root = np.arcsin(np.sqrt(extended(intensity))) * 2 / PI
     truth = root if branch == 1 else 2 - root
     phase = phase_from_intensity(np.array(intensity), branch)
@@ -155,11 +147,7 @@ def jones_intensity(angles_rad: Sequence[float]) -> float:
 
 
 def product(values: Sequence[float]) -> Answer:
-    """Compare two formulas for the intensity with the reference: sin² of the phase, and Jones matrices.
-
-    Args:
-        values: Panel values along a ray, in [0, 1].
-    """
+    """Compare sin² of the phase of panel values in [0, 1] along a ray, and Jones matrices, with the reference."""
     truth = np.sin(PI / 2 * extended(values).sum()) ** 2
     by_sum = float(intensity_from_phase(np.array(math.fsum(values))))
     by_product = jones_intensity([value * math.pi / 2 for value in values])

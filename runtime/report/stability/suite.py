@@ -21,12 +21,7 @@ LIMITS = Path(__file__).with_name("limits.json")  # recorded forward errors, key
 
 
 def every_trial(fits: Mapping[str, Fit], *, full: bool) -> Iterator[Trial]:
-    """Yield the trials for all stages.
-
-    Args:
-        fits: Calibration solvers, keyed by method name.
-        full: Include trials that take a long time.
-    """
+    """Yield the trials for all stages, with calibration solvers by method, and with long ones if `full`."""
     yield from optics.trials()
     yield from models.trials(full=full)
     yield from tracking.trials(full=full)
@@ -36,13 +31,7 @@ def every_trial(fits: Mapping[str, Fit], *, full: bool) -> Iterator[Trial]:
 def run(
     trials: list[Trial], *, record: Path | None = None, progress: Callable[[int, int], None] = lambda done, of: None
 ) -> list[Case]:
-    """Run all trials and return their cases.
-
-    Args:
-        trials: Trials to run.
-        record: File to write the recorded errors to, updated with the measured ones. None: write no file.
-        progress: Function called after each trial with the number of trials finished and the total number.
-    """
+    """Run all trials and return their cases; update the errors in the file `record`, if given."""
     limits: dict[str, float] = json.loads(LIMITS.read_text(encoding="utf-8"))
     cases = []
     for number, trial in enumerate(trials, 1):

@@ -22,12 +22,7 @@ FLOOR_M = 1e-6  # difference that may be due to another machine's rounding
 
 
 def head_m(time_ns: int, *, span_ns: int) -> F64:
-    """Return the left and right eyes of a uniformly moving head, shape (2, 3), in the `stack` frame.
-
-    Args:
-        time_ns: Time since the motion started.
-        span_ns: Time taken to move by TRAVEL_M, or by less if the head would otherwise exceed FASTEST.
-    """
+    """Return the (2, 3) eyes of a head that moves uniformly by TRAVEL_M in `span_ns`, or at most at FASTEST."""
     share = min(1.0, FASTEST * span_ns / NS_PER_S / float(np.linalg.norm(TRAVEL_M)))
     return EYES_M + TRAVEL_M * share * (time_ns / max(span_ns, 1))
 
@@ -44,12 +39,8 @@ def still(updates: int) -> Answer:
 
 
 def after(steps_ns: list[int], ahead_ns: int, *, lost: bool = False) -> Answer:
-    """Measure the predicted eyes' error for a head that was sampled at irregular intervals.
-
-    Args:
-        steps_ns: Intervals between the samples.
-        ahead_ns: Time from the last sample to the instant to predict.
-        lost: The last sample is too old to predict from, so the tracker must return no position.
+    """Measure the error of eyes predicted `ahead_ns` after samples at irregular intervals. If `lost`, the last sample
+    is too old, and the tracker must return no position.
     """
     tracker, now_ns, span_ns = Tracker(), 0, sum(map(abs, steps_ns)) + ahead_ns
     for step_ns in (0, *steps_ns):
@@ -64,11 +55,7 @@ def after(steps_ns: list[int], ahead_ns: int, *, lost: bool = False) -> Answer:
 
 
 def trials(*, full: bool = False) -> Iterator[Trial]:
-    """Yield all trials for the tracker.
-
-    Args:
-        full: Include a trial with a million updates.
-    """
+    """Yield all trials for the tracker, with a million updates if `full`."""
     for updates in (10_000, *((1_000_000,) if full else ())):
         yield Trial(STAGE, f"{updates} updates of a still head", partial(still, updates), measure="m")
     hour, usual = 3600 * NS_PER_S, [FRAME_NS] * 30

@@ -1,7 +1,4 @@
-"""Trials (extreme cases to run) and their outcomes.
-
-Running a trial yields an outcome (`Case`) even if the tested code raises an exception.
-"""
+"""Trials (extreme cases to run) and their outcomes (`Case`), also if the tested code raises an exception."""
 
 from __future__ import annotations
 
@@ -65,14 +62,9 @@ class Case:
 
 
 def settle(trial: Trial, *, limit: float | None = None) -> Case:
-    """Run a trial and return its outcome. An exception raised by the tested code is part of the outcome.
-
-    A trial that expects a refusal passes if the code raises one of the project's errors or a ValueError. With any other
+    """Run a trial and return its outcome, given a recorded forward error, which a trial with a floor needs. A trial
+    that expects a refusal passes if the code raises one of the project's errors or a ValueError. With any other
     exception, the trial fails.
-
-    Args:
-        trial: Trial to run.
-        limit: Recorded forward error. A trial that has a floor fails if no error is recorded.
     """
     try:
         with warnings.catch_warnings():
