@@ -20,13 +20,9 @@ WIDTH_KEY = "subnets.in_conv.0.weight"
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
-    """Read a checkpoint: a dictionary whose `model` entry is a state dictionary of tensors.
-
-    Only plain values, tensors and an `argparse.Namespace` of plain values (which the published code saves) are
-    deserialised.
-
-    Raises:
-        InputError: The file cannot be read, contains other objects, or has no `model` entry.
+    """Read a checkpoint: a dictionary whose `model` entry is a state dictionary of tensors. Only plain values, tensors
+    and an `argparse.Namespace` of plain values (which the published code saves) are deserialised. Raises InputError if
+    the file cannot be read, contains other objects, or has no `model` entry.
     """
     data = untrusted_input.read_bytes(path, most_bytes=FILE_BYTES_MAX)
     try:
@@ -41,10 +37,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def eyereal_width(state: Mapping[str, Tensor], *, source: Path) -> int:
-    """Return the number of channels in a published network's first layer, as read from its weights.
-
-    Raises InputError if the weights do not belong to the published network.
-    """
+    """Return the channels of a published network's first layer, by its weights. Raises InputError for other weights."""
     first = state.get(WIDTH_KEY)
     if first is None or first.ndim != 4:
         raise InputError(source, WIDTH_KEY, "is missing, so this is not a checkpoint of the published network")
@@ -52,17 +45,7 @@ def eyereal_width(state: Mapping[str, Tensor], *, source: Path) -> int:
 
 
 def fill(net: nn.Module, state: Mapping[str, Tensor], *, source: str | Path, arch: str) -> None:
-    """Load weights into a network.
-
-    Args:
-        net: Network to modify.
-        state: Weights, keyed by name.
-        source: File the weights come from, used in error messages.
-        arch: Name of the network, used in error messages.
-
-    Raises:
-        InputError: A weight is missing, unknown, of the wrong shape or not finite. The message names the weight.
-    """
+    """Load weights by name into a network. Raises InputError, which names the weight, if one is missing or wrong."""
     expected = net.state_dict()
     missing = [key for key in expected if key not in state]
     # Old checkpoints lack this counter, which is not used for inference.

@@ -38,9 +38,8 @@ def random_stack(random: Random, *, width_px: int, height_px: int) -> PanelStack
 
 
 def random_eyes(random: Random, stack: PanelStack) -> F64:
-    """Return random left and right eye positions in the `stack` frame, as a (2, 3) array.
-
-    The head is 0.1 to 4 m from the origin and at least 0.1 m in front of the panels, and may be rolled and turned.
+    """Return random (2, 3) eyes in `stack`, of a head that may be rolled and turned. It is 0.1 to 4 m from the origin
+    and at least 0.1 m in front of the panels.
     """
     front_m = stack.x_m[-1]
     distance_m = math.exp(random.uniform(math.log(0.1 + front_m), math.log(4.0)))
@@ -61,12 +60,7 @@ def random_eyes(random: Random, stack: PanelStack) -> F64:
 
 
 def is_served(eyes_m: Eyes, stack: PanelStack) -> bool:
-    """Return True if each eye sees at least `LEAST_COMMON` of the middle panel through all panels.
-
-    Args:
-        eyes_m: The eyes' positions (2, 3) in the `stack` frame.
-        stack: Geometry of the three panels.
-    """
+    """Return True if each eye (2, 3) sees at least `LEAST_COMMON` of the middle panel through all panels."""
     for x_m, *aside_m in eyes_m:
         t = (np.array(stack.x_m) - stack.x_m[CENTRE]) / (x_m - stack.x_m[CENTRE])
         for size_m, eye_m in zip((stack.width_m, stack.height_m), aside_m, strict=True):
@@ -79,10 +73,7 @@ def is_served(eyes_m: Eyes, stack: PanelStack) -> bool:
 def random_place(
     random: Random, *, width_px: int, height_px: int, stack: PanelStack | None = None
 ) -> tuple[PanelStack, F64]:
-    """Return panels, and random eye positions (2, 3) with enough of the panels in view.
-
-    The panels are `stack` or, if that is None, random panels of the given size in pixels.
-    """
+    """Return `stack`, or random panels of this size in pixels, and random (2, 3) eyes that see enough of them."""
     while True:
         panels = stack or random_stack(random, width_px=width_px, height_px=height_px)
         eyes = random_eyes(random, panels)
@@ -93,13 +84,8 @@ def random_place(
 def random_pair(
     random: Random, *, width_px: int, height_px: int, stack: PanelStack | None = None, fov_deg: float = 0.0
 ) -> TrainingPair:
-    """Draw a random scene as seen from random eye positions.
-
-    Args:
-        width_px: Width of the pictures and of any random panels.
-        height_px: Height of the pictures and of any random panels.
-        stack: Panel geometry, or None for random panels.
-        fov_deg: The pictures' horizontal field of view, or 0 for pictures as wide as the panels.
+    """Draw a random scene as seen from random eyes, on `stack` or on random panels of the pictures' size. With
+    `fov_deg` 0, the pictures are as wide as the panels.
     """
     stack, eyes = random_place(random, width_px=width_px, height_px=height_px, stack=stack)
     scene = random_scene(random, stack, eyes.mean(axis=0))

@@ -41,23 +41,11 @@ def export_model(
     eye_order: EyeOrder = "left-right",
     options: dict[str, Any] | None = None,
 ) -> Report:
-    """Build a model, check its ONNX file, and write the file if all checks pass.
+    """Build a model, check its ONNX file, write it if all checks pass, and return their results.
 
-    Args:
-        arch: Name of a shipped model or a picture network, or `module:Class`.
-        out: ONNX file to write.
-        checkpoint: File with a picture network's weights.
-        random_init: Seed for random weights, used instead of a checkpoint.
-        width_px: Width of a picture network's pictures; must be even.
-        height_px: Height of a picture network's pictures; must be even.
-        eye_order: Order of the eyes in a picture network's input.
-        options: Arguments for the picture network's class.
-
-    Returns:
-        The results of the checks.
-
-    Raises:
-        InputError: The arguments do not fit together, or the network cannot be built or exported.
+    `arch` is a shipped model, a picture network, or `module:Class`, whose `options` are its arguments; the other
+    arguments are a picture network's: even sizes, and a seed of random weights instead of a checkpoint. Raises
+    InputError if they do not fit together, or the network cannot be built or exported.
     """
     check_known(arch, *SHIPPED)
     if checkpoint is not None and random_init is not None:
@@ -93,11 +81,7 @@ def in_torch(module: nn.Module) -> Reference:
 
 
 def spectral_model(name: str) -> tuple[bytes, nn.Module]:
-    """Build a shipped model from its recipe.
-
-    Returns:
-        The ONNX file, including the contract, and the torch module.
-    """
+    """Build a shipped model from its recipe: the ONNX file with its contract, and the torch module."""
     recipe = read_recipe(name)
     net = SpectralSolver(recipe.cell_px).eval()
     contract = Contract(
@@ -128,19 +112,9 @@ def spectral_model(name: str) -> tuple[bytes, nn.Module]:
 def picture_network(
     arch: str, checkpoint: Path | None, random_init: int | None, options: dict[str, Any]
 ) -> tuple[Network, str]:
-    """Create a picture network with trained or random weights.
-
-    Args:
-        arch: Name of the network, or `module:Class`.
-        checkpoint: File with the weights, or None. A checkpoint from `phasestack train` contains the network's options.
-        random_init: Seed for random weights, used if there is no checkpoint.
-        options: Arguments for the network's class. They override those in the checkpoint.
-
-    Returns:
-        The network and a SHA-256 that identifies its weights.
-
-    Raises:
-        InputError: There are no weights, or the checkpoint does not belong to this network.
+    """Create a picture network (name or `module:Class`) and a SHA-256 that identifies its weights. These are a
+    checkpoint's, or random. `options` for the class override those in a checkpoint from `phasestack train`. Raises
+    InputError if there are no weights, or the checkpoint does not belong to this network.
     """
     if checkpoint is None:
         if random_init is None:
@@ -166,15 +140,8 @@ def picture_network(
 def picture_file(
     network: Network, origin: str, *, width_px: int, height_px: int, eye_order: EyeOrder = "left-right"
 ) -> bytes:
-    """Export a picture network to an ONNX file for pictures of one size.
-
-    Args:
-        network: Network to export.
-        origin: SHA-256 that identifies the weights, stored in the contract.
-        eye_order: Order of the eyes in the input, stored in the contract.
-
-    Raises:
-        InputError: The network fails for pictures of this size, or torch cannot export it.
+    """Export a picture network, whose contract gets `origin` and the order of eyes, to ONNX for pictures of one size.
+    Raises InputError if it fails for pictures of this size, or torch cannot export it.
     """
     form, net, size = network.form, network.net.eval(), {"width_px": width_px, "height_px": height_px}
     probe(network, **size)

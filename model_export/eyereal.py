@@ -30,10 +30,8 @@ def _block(channels: int, middle: int, out: int) -> nn.Sequential:
 
 
 class Up(nn.Module):
-    """A decoder stage of the U-Net.
-
-    It doubles its input's size (bilinear, aligned corners), pads the result to the skip connection's size, concatenates
-    the two and applies two convolutions.
+    """A decoder stage: double the input (bilinear, aligned corners), pad it to the skip connection's size, join,
+    convolve.
     """
 
     def __init__(self, channels: int, out: int) -> None:
@@ -50,10 +48,7 @@ class Up(nn.Module):
 
 
 class UNet(nn.Module):
-    """U-Net with five levels; the published network's `subnets` module.
-
-    It has 17,303,721 parameters at width 32 and 4,329,561 at width 16.
-    """
+    """U-Net with five levels; the published network's `subnets` module (17,303,721 parameters at width 32)."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -81,10 +76,9 @@ class UNet(nn.Module):
 
 
 class EyeRealNet(nn.Module):
-    """The published network, which maps the eyes' pictures, resampled for every panel, to panel values.
-
-    The input channels are intensities in [0, 1], ordered by panel, then eye, then RGB. The output channels are ordered
-    by panel, then RGB. The outputs are in [-0.2, 0.8], as in the published code, and the panel clips negative values.
+    """The published network, which maps the eyes' pictures, resampled for every panel, to panel values. The input
+    channels are intensities in [0, 1], ordered by panel, then eye, then RGB. The output channels are ordered by panel,
+    then RGB. The outputs are in [-0.2, 0.8], as in the published code, and the panel clips negative values.
     """
 
     input_frame, input_value, output = "panel", "intensity", "panels"

@@ -28,10 +28,7 @@ STEPS_MOST = 64  # maximum number of steps that a contract can hold
 
 
 class Form(Section):
-    """A picture network's input and output format.
-
-    The network's class attributes override the defaults.
-    """
+    """A picture network's input and output format, which its class attributes override."""
 
     input_frame: Literal["centre", "panel"] = Field(
         "centre",
@@ -66,10 +63,7 @@ class Network:
     options: dict[str, Any]  # arguments used to create `net`
 
     def steps(self) -> tuple[Sequence[Any], Sequence[Any]]:
-        """Return the sizes and momenta of the solver steps that follow the network.
-
-        They are the network's `step_sizes` and `step_momenta` tensors if these exist, otherwise constants.
-        """
+        """Return the sizes and momenta of the steps that follow: tensors `step_sizes`, `step_momenta`, or constants."""
         learned = [getattr(self.net, name, None) for name in ("step_sizes", "step_momenta")]
         if isinstance(learned[0], Tensor) and isinstance(learned[1], Tensor):
             return list(learned[0].clamp(1e-3, 3)), list(learned[1].clamp(0, 0.99))
@@ -78,12 +72,7 @@ class Network:
 
 @contextmanager
 def blamed(arch: str, field: str) -> Iterator[None]:
-    """Convert any exception raised by a user's module to a one-line InputError.
-
-    Args:
-        arch: Name of the module, used in the message.
-        field: Operation that failed, used in the message.
-    """
+    """Convert any exception of a user's module to an InputError that names the module and the operation `field`."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -102,15 +91,9 @@ def check_known(arch: str, *others: str) -> None:
 
 
 def make_network(arch: str, options: dict[str, Any], *, seed: int = 0) -> Network:
-    """Create a picture network with random weights.
-
-    Args:
-        arch: Name of a network, or `module:Class`.
-        options: Arguments for the class, and optionally `steps`, the number of solver steps that follow the network.
-        seed: Seed for the weights.
-
-    Raises:
-        InputError: The network is unknown, the class cannot be loaded or created, or an attribute or option is invalid.
+    """Create a picture network, by name or `module:Class`, with random weights. `options` are the class's arguments,
+    and `steps`, the number of solver steps that follow. Raises InputError if the network is unknown, the class cannot
+    be loaded or created, or an attribute or option is invalid.
     """
     check_known(arch)
     kind = plugin_class(KNOWN.get(arch, arch), nn.Module, field="--arch")
@@ -149,10 +132,7 @@ def probe(network: Network, *, width_px: int, height_px: int) -> None:
 
 
 def check_static(network: Network, *, width_px: int, height_px: int) -> None:
-    """Raise InputError if the network branches on its input's values.
-
-    A graph cannot represent such branches.
-    """
+    """Raise InputError if the network branches on its input's values, which a graph cannot represent."""
     example = torch.zeros(1, network.form.channels, height_px, width_px)
     try:
         with quiet(), redirect_stderr(StringIO()), torch.no_grad():  # torch prints any graph that it cannot trace

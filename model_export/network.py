@@ -53,18 +53,9 @@ class SpectralSolver(nn.Module):
         self.log_sigma_scale = nn.Parameter(torch.zeros(2))  # factors for eye_sigma_px along and across the eyes' line
 
     def gains(self, spectrum: Tensor, cell_frequencies: Tensor, eye_sigma_px: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Compute the gains from the transformed input to g and h.
-
-        A pattern is the product of a wave along a block's rows and a wave along a cell's columns.
-
-        Args:
-            spectrum: The chain's singular values s (cells + 1,).
-            cell_frequencies: The input of `forward` with this name (2K,).
-            eye_sigma_px: The input of `forward` with this name (3,).
-
-        Returns:
-            The numerator and denominator of g's gain, which excludes the part explained by h, and h's gain. All three
-            have shape (patterns, cells + 1).
+        """Return the numerator and denominator of g's gain without the part explained by h, and h's gain. All have
+        shape (patterns, cells + 1): a pattern is a wave along a block's rows times one along a cell's columns.
+        `spectrum` are the chain's singular values; the others are inputs of `forward`.
         """
         scale = torch.exp(self.log_sigma_scale)
         # The product of a chain mode and a block's pattern is two waves, at the pattern's frequency ± `offset`.
@@ -88,22 +79,16 @@ class SpectralSolver(nn.Module):
         return share * m * spectrum[None], share * alpha2 + cost_g, gain_h
 
     def forward(self, *feeds: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Compute the rear and front panels for C colour channels.
+        """Compute the rear and front panels for C colour channels from the tensors named in `INPUTS`.
 
-        Args:
-            *feeds: The tensors named in `INPUTS`.
+        * `left`, `right`: each eye's residual along its rays through the raster, (rows, cells, 2K·C) 16-bit codes.
+        * `waves`, `shifted_waves`, `spectrum`, `modes_in`: V and Ũ (cells + 1, cells + 1), s (cells + 1,) and
+         U^T (cells + 1, cells) from `runtime.model.chain.chain_modes`.
+        * `cell_waves`, `cell_frequencies`: (2K, 2K) and (2K,) from `runtime.model.chain.cell_waves`.
+        * `eye_sigma_px`: c, r and e (3,). c and e are in units of the parallax divided by `cell_px`, and r is in rows.
 
-                * `left`, `right`: each eye's residual along its rays through the raster, (rows, cells, 2K·C) 16-bit
-                  codes.
-                * `waves`, `shifted_waves`, `spectrum`, `modes_in`: V and Ũ (cells + 1, cells + 1), s (cells + 1,) and
-                  U^T (cells + 1, cells) from `runtime.model.chain.chain_modes`.
-                * `cell_waves`, `cell_frequencies`: (2K, 2K) and (2K,) from `runtime.model.chain.cell_waves`.
-                * `eye_sigma_px`: c, r and e (3,). c and e are in units of the parallax divided by `cell_px`, and r is
-                  in rows.
-
-        Returns:
-            The rear and front panels, as (rows, cells + 1, 2K·C) 16-bit codes that begin one parallax before column 0,
-            and a number (1,) that is finite if all intermediate results are finite.
+        Panels are (rows, cells + 1, 2K·C) 16-bit codes that begin one parallax before column 0. The last output (1,) is
+        finite if all intermediate results are.
         """
         rear, front, check = self._solved(feeds, added=0.5)
         # The cast truncates. Having a half added makes it round instead, because the values are clamped to be
@@ -112,11 +97,9 @@ class SpectralSolver(nn.Module):
         return (*codes, check)  # type: ignore[return-value]
 
     def _solved(self, feeds: tuple[Tensor, ...], *, added: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the rear and front panels, each (1, rows of a block, all others), and the check.
-
-        The panels are in 16-bit codes plus `added`. Corresponding rows of all blocks are stored together, and each row
-        of a cell stays contiguous. Copies are therefore cheap, and the products with the row and chain matrices are few
-        and large.
+        """Return the rear and front panels, each (1, rows of a block, all others), in 16-bit codes plus `added`, and
+        the check. Corresponding rows of all blocks are stored together, and each row of a cell stays contiguous. Copies
+        are therefore cheap, and the products with the row and chain matrices are few and large.
         """
         left, right, waves, shifted_waves, spectrum, modes_in, cell_waves, cell_frequencies, eye_sigma_px = feeds
         numerator, denominator, gain_h = self.gains(spectrum, cell_frequencies, eye_sigma_px)
@@ -135,15 +118,9 @@ class SpectralSolver(nn.Module):
 
 
 def _in_columns(x: Tensor, gains: Tensor, cell_waves: Tensor) -> Tensor:
-    """Scale each wave along a cell's columns by its gain.
-
+    """Scale each wave along a cell's columns (2K, 2K) by its gain (n·2K, modes), for values (n, modes, blocks, 2K·C).
     For each row wave and each mode, a single matrix transforms the columns to waves, scales the waves and transforms
     them back.
-
-    Args:
-        x: Values (n, modes, blocks, 2K·C) for n row waves.
-        gains: Gains (n·2K, modes).
-        cell_waves: Waves (2K, 2K) along a cell's columns.
     """
     count, modes, _, row = x.shape
     columns = cell_waves.shape[0]
@@ -178,10 +155,7 @@ def _size(x: Tensor) -> Tensor:
 
 
 def _cosines(size: int) -> tuple[Tensor, Tensor]:
-    """Return the orthonormal cosine basis (size, size) and its frequencies in radians per sample.
-
-    Each row of the basis is one wave.
-    """
+    """Return the orthonormal cosine basis (size, size), a wave per row, and its frequencies in radians per sample."""
     k, at = torch.arange(size, dtype=torch.float64)[:, None], torch.arange(size, dtype=torch.float64) + 0.5
     basis = torch.cos(math.pi * k * at / size) * math.sqrt(2 / size)
     basis[0] /= math.sqrt(2)

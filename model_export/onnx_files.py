@@ -74,15 +74,8 @@ def _exported(
     *,
     folded: bool = True,
 ) -> bytes:
-    """Export a module to an ONNX file.
-
-    Args:
-        net: Module to export, in evaluation mode.
-        example: Example inputs.
-        inputs: Input names.
-        outputs: Output names.
-        axes: Names of the dimensions, keyed by input or output. Dimensions not listed in `FIXED` are variable.
-        folded: Fold constants. If False, the weights keep their names.
+    """Export a module in evaluation mode to ONNX; dimensions in `axes`, but not in `FIXED`, are variable. If constants
+    are not `folded`, the weights keep their names.
     """
     buffer = io.BytesIO()
     with quiet(), torch.no_grad():

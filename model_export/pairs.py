@@ -35,12 +35,7 @@ PICTURE_FOV_DEG = 40.0  # field of view of the pictures in the published data se
 
 @dataclass(frozen=True)
 class TrainingPairs(Dataset[dict[str, Tensor]]):
-    """Data set used to train a picture network.
-
-    Each pair depends only on the seed and the pair's number.
-
-    The pictures are read from a folder, rendered from a scene, or generated at random.
-    """
+    """Data set from a folder, a scene, or random scenes. A pair depends only on the seed and its number."""
 
     form: Form  # the network's input format
     seed: int
@@ -53,12 +48,8 @@ class TrainingPairs(Dataset[dict[str, Tensor]]):
     scene: str = ""  # scene to render at random rotations about the vertical axis; if empty, pairs are generated
 
     def __getitem__(self, number: int) -> dict[str, Tensor]:
-        """Return a pair as tensors.
-
-        Returns:
-            `input` is the network's input (channels, H, W), and `targets` holds the target intensities (2, 3, h, w).
-            `believed` and `views` are homographies (2, N, 3, 3) as in `light.Views`, for the estimated and for the true
-            eye positions.
+        """Return a pair: the network's `input` (channels, H, W), and target intensities `targets` (2, 3, h, w).
+        `believed` and `views` are homographies (2, N, 3, 3) as in `light.Views`, for the estimated and the true eyes.
         """
         pair = self.pair(number)
         random = np.random.default_rng([self.seed, number, 1])
@@ -110,19 +101,12 @@ class TrainingPairs(Dataset[dict[str, Tensor]]):
 
 @lru_cache(maxsize=2)
 def opened(scene: str, stack: PanelStack, _process: int) -> ContentSource:
-    """Open a scene for rendering in this process, which must have a single thread.
-
-    Raises InputError if the scene cannot be loaded.
-    """
+    """Open a scene for rendering in this process, which must have a single thread. Raises InputError."""
     return open_content(ContentSettings(scene=scene), stack, offscreen_context())
 
 
 def folder_pairs(folder: Path) -> tuple[Pair, ...]:
-    """Read the pairs in a folder laid out like the published data set.
-
-    Raises:
-        InputError: The folder's name does not contain a published scene's name, or the folder is invalid.
-    """
+    """Read the pairs in a folder named and laid out like the published data set. Raises InputError."""
     name = next((name for name in preset_names() if name in folder.resolve().name), "")
     if not name:
         raise InputError(folder, "name", f"the folder's name must contain one of {', '.join(preset_names())}")
@@ -137,13 +121,7 @@ def prototype(*, width_px: int, height_px: int) -> PanelStack:
 
 
 def photographed(pair: Pair, stack: PanelStack, fov_deg: float) -> TrainingPair:
-    """Resample a published pair as if the eyes looked at the display's centre.
-
-    Args:
-        pair: Pair to resample.
-        stack: Panel geometry. The pictures are resized to the panels' size in pixels.
-        fov_deg: The pictures' horizontal field of view in degrees.
-    """
+    """Resample a published pair as if the eyes looked at the display's centre, at the panels' size in pixels."""
     size, images = {"width_px": stack.width_px, "height_px": stack.height_px}, []
     for side, eye_m in enumerate(pair.eyes_m):
         size_px = stack.width_px, stack.height_px
@@ -155,10 +133,7 @@ def photographed(pair: Pair, stack: PanelStack, fov_deg: float) -> TrainingPair:
 
 
 def network_input(pair: TrainingPair, form: Form) -> F32:
-    """Return a picture network's input (channels, H, W).
-
-    The channels are ordered by panel, then eye, then RGB.
-    """
+    """Return a picture network's input (channels, H, W), ordered by panel, then eye, then RGB."""
     stack, table = pair.stack, np.arange(256, dtype=np.float32) / np.float32(255)
     if form.input_value == "phase":
         table = phase_from_intensity(table, form.branch)
@@ -174,13 +149,7 @@ def network_input(pair: TrainingPair, form: Form) -> F32:
 
 
 def _warped(picture: U8, picture_from_raster: F64, stack: PanelStack, border: int) -> U8:
-    """Resample a picture bilinearly to a panel's pixels.
-
-    Args:
-        picture: Picture (h, w, 3).
-        picture_from_raster: Homography from panel pixels to picture pixels.
-        border: OpenCV's border mode for pixels outside the picture.
-    """
+    """Resample a picture bilinearly to a panel's pixels, with OpenCV's border mode outside."""
     matrix = between_pixel_centres(picture_from_raster)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     size = stack.width_px, stack.height_px

@@ -18,10 +18,7 @@ Random = np.random.Generator
 
 @dataclass(frozen=True, slots=True)
 class Parallelogram:
-    """Textured parallelogram of a scene.
-
-    The texture's point (u, v) is at corner + u·across + v·down for 0 <= u, v <= 1.
-    """
+    """Textured parallelogram: texture point (u, v) is at corner + u·across + v·down for 0 <= u, v <= 1."""
 
     texture: U8  # (h, w, 4) RGBA
     corner_m: F64  # (3,) top left corner, frame `stack`
@@ -33,14 +30,8 @@ Scene = tuple[Parallelogram, ...]
 
 
 def draw(scene: Scene, projection: F64, *, width_px: int, height_px: int) -> U8:
-    """Draw a picture (h, w, 3) of a scene.
-
-    Each pixel shows the plane that is nearest there. Translucent edges are blended with the planes drawn earlier.
-    Nothing behind the eye is drawn.
-
-    Args:
-        scene: Planes, in the order they are drawn.
-        projection: 3x4 projection from homogeneous metres in the `stack` frame to homogeneous pixels.
+    """Draw a picture (h, w, 3) of planes by a 3x4 projection from `stack`, the nearest at each pixel. Translucent edges
+    are blended with the planes drawn earlier. Nothing behind the eye is drawn.
     """
     width, height = width_px * FINER, height_px * FINER
     picture = np.zeros((height, width, 3), np.float32)
@@ -59,10 +50,7 @@ def draw(scene: Scene, projection: F64, *, width_px: int, height_px: int) -> U8:
 
 
 def _part(raster_from_plane: F64, width: int, height: int) -> tuple[slice, slice] | None:
-    """Return the raster rows and columns that a plane can cover, or None if it is not visible.
-
-    The homography maps the plane's texture coordinates (u, v, 1) to raster pixels.
-    """
+    """Return the raster rows and columns that a plane, by its homography of (u, v, 1), can cover, or None."""
     corners = raster_from_plane @ np.array([[0, 1, 1, 0], [0, 0, 1, 1], [1, 1, 1, 1]], dtype=np.float64)
     area = np.linalg.det(raster_from_plane)
     if not np.isfinite(area) or abs(area) < 1e-12 or (corners[2] <= 0).all():
@@ -76,15 +64,7 @@ def _part(raster_from_plane: F64, width: int, height: int) -> tuple[slice, slice
 
 
 def _draw_plane(texture: U8, raster_from_plane: F64, part: tuple[slice, slice], picture: F32, nearness: F32) -> None:
-    """Draw a plane wherever it is nearer than the planes drawn so far.
-
-    Args:
-        texture: The plane's texture (h, w, 4).
-        raster_from_plane: Homography from texture coordinates (u, v, 1) to picture pixels.
-        part: Rows and columns of the picture that the plane can cover.
-        picture: Picture (H, W, 3), updated in place.
-        nearness: Reciprocal distance (H, W) of the planes in the picture, updated in place.
-    """
+    """Draw a texture (h, w, 4) in a part of `picture`, in place, where its plane is nearer than `nearness` (H, W)."""
     rows, columns = part
     left, top = columns.start, rows.start
     height, width = texture.shape[:2]
@@ -108,10 +88,7 @@ def _shift(right: float, down: float) -> F64:
 
 
 def random_scene(random: Random, stack: PanelStack, middle_m: F64) -> Scene:
-    """Return a random scene for a viewer whose head is near `middle_m` (3,) in the `stack` frame.
-
-    The scene has a backdrop and cards at random depths behind and in front of the panels.
-    """
+    """Return a backdrop and cards at random depths, for a viewer whose head is near `middle_m` (3,)."""
     centre_m = stack.x_m[1]
     distance_m = middle_m[0] - centre_m
     deep_m = (stack.x_m[-1] - centre_m) * math.exp(random.uniform(math.log(0.3), math.log(6.0)))
@@ -122,14 +99,8 @@ def random_scene(random: Random, stack: PanelStack, middle_m: F64) -> Scene:
     tones = np.clip(np.rint((np.arange(256) - 127.5) * contrast + 127.5 + 255 * level), 0, 255).astype(np.uint8)
 
     def card(x_m: float, size_m: F64, aside: F64, *, slant: float, see_through: bool) -> Parallelogram:
-        """Return a card with a random texture.
-
-        Args:
-            x_m: The card's depth in the `stack` frame.
-            size_m: The card's width and height (2,).
-            aside: Position (2,) where the viewer sees the card on the middle panel, relative to the panel's size.
-            slant: The card's maximum rotation, in radians.
-            see_through: Make the texture opaque only on lines.
+        """Return a card with a random texture, rotated by at most `slant` rad, opaque only on lines if `see_through`.
+        `aside` (2,) is where the viewer sees it on the middle panel, relative to the panel's size.
         """
         share = (x_m - centre_m) / distance_m
         middle = aside * panel_m * (1 - share) + middle_m[1:] * share
@@ -154,15 +125,8 @@ def random_scene(random: Random, stack: PanelStack, middle_m: F64) -> Scene:
 
 
 def _texture(random: Random, width: int, height: int, tones: U8, *, see_through: bool) -> U8:
-    """Return a random RGBA texture (height, width, 4).
-
-    The texture is either noise whose power decreases with frequency, or a collage of discs and boxes.
-
-    Args:
-        width: Texture width.
-        height: Texture height.
-        tones: Lookup table (256,) applied to all colours.
-        see_through: Make the texture opaque only on random lines.
+    """Return a random RGBA texture of noise whose power decreases with frequency, or of discs and boxes. `tones` (256,)
+    is applied to all colours. If `see_through`, only random lines are opaque.
     """
     picture = np.full((height, width, 4), 255, np.uint8)
     if random.random() < 0.5:

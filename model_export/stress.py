@@ -77,15 +77,8 @@ def picture_cases(contract: Contract, height: int, width: int) -> dict[str, Feed
 
 
 def picture_feeds(pictures: tuple[F32, F32], contract: Contract, panels: int) -> Feeds:
-    """Convert a pair of pictures to a picture network's input.
-
-    Args:
-        pictures: Left and right intensities (h, w, 3) in [0, 1].
-        contract: The network's contract.
-        panels: Number of panels to repeat the pictures for.
-
-    Returns:
-        The input's name, mapped to its value (1, 6·panels, h, w). Channels are ordered by panel, then eye, then RGB.
+    """Return a picture network's named input (1, 6·panels, h, w), by panel, then eye, then RGB, for intensities (h, w,
+    3).
     """
     if contract.input_value == "phase":
         left, right = (phase_from_intensity(picture, contract.branch) for picture in pictures)

@@ -63,18 +63,9 @@ class Training(Section):
 
 
 def run_training(out: Path, training: Training, *, device: Device = "auto", resume: bool = False) -> dict[str, Any]:
-    """Train a picture network.
-
-    The checkpoint, the learning curve and its plot are written at regular intervals.
-
-    Args:
-        out: Folder for `checkpoint.pth`, `curve.csv` and `curve.png`.
-        training: Training settings.
-        device: Device to train on. `auto` selects a GPU if torch finds one.
-        resume: Continue from the checkpoint in `out`.
-
-    Raises:
-        InputError: The network, the data or the checkpoint is invalid, or the loss is not finite.
+    """Train a picture network, and write `checkpoint.pth`, `curve.csv` and `curve.png` to a folder at intervals.
+    `resume` continues from its checkpoint. Raises InputError if the network, the data or the checkpoint is invalid, or
+    the loss is not finite.
     """
     place, start = _placed(device), time.monotonic()
     network = make_network(training.arch, training.options, seed=training.seed)
@@ -145,10 +136,7 @@ def run_training(out: Path, training: Training, *, device: Device = "auto", resu
 
 @contextlib.contextmanager
 def _signals() -> Iterator[list[int]]:
-    """Yield a list that receives the first SIGINT or SIGTERM. A second signal exits immediately.
-
-    The caller must check the list after each iteration.
-    """
+    """Yield a list, to check after each iteration, of the first SIGINT or SIGTERM; a second one exits immediately."""
     came: list[int] = []
 
     def take(number: int, frame: FrameType | None) -> None:
@@ -174,10 +162,7 @@ def displayed(panels: Tensor) -> Tensor:
 
 
 def _loss(network: Network, batch: Batch) -> Tensor:
-    """Return the light PSNR in dB, averaged over the pairs and negated.
-
-    Averaging logarithms gives easy and hard pairs equal weight.
-    """
+    """Return the negated light PSNR in dB, averaged over pairs, which gives easy and hard ones equal weight."""
     with torch.autocast(batch["input"].device.type, torch.bfloat16, enabled=batch["input"].is_cuda):
         answer = network.net.train()(batch["input"])
     losses = []
@@ -190,10 +175,7 @@ def _loss(network: Network, batch: Batch) -> Tensor:
 
 
 def _shown(network: Network, answer: Tensor, batch: Batch) -> Iterator[Tensor]:
-    """Yield the displayed panel values (N, C, H, W) of each pair in a batch.
-
-    The solver's steps, computed for the estimated eye positions, are applied to the network's output.
-    """
+    """Yield the displayed panel values (N, C, H, W) of each pair, after the solver's steps for the estimated eyes."""
     for panels, targets, matrices in zip(displayed(answer.float()), batch["targets"], batch["believed"], strict=True):
         views = Views(matrices, targets.shape[-1], targets.shape[-2])
         x = panels.reshape(PANELS, COLOURS, *panels.shape[1:])
@@ -216,10 +198,7 @@ def _held_out_db(network: Network, batches: list[Batch], device: torch.device) -
 
 
 def _data(training: Training, form: Form) -> tuple[TrainingPairs, TrainingPairs]:
-    """Return the training pairs and the validation pairs.
-
-    Raises InputError if the panels or the folder of pairs is unsuitable, or if both a folder and a scene are given.
-    """
+    """Return training and validation pairs. Raises InputError for unsuitable panels, a folder, or folder and scene."""
     width_px, height_px = training.width_px, training.height_px
     stack = load_stack(Path(training.panels), width_px=width_px, height_px=height_px) if training.panels else None
     if stack is not None:
@@ -239,10 +218,7 @@ def _data(training: Training, form: Form) -> tuple[TrainingPairs, TrainingPairs]
 
 
 def _loader(pairs: TrainingPairs, training: Training, first: int, last: int) -> DataLoader[Batch]:
-    """Load the batches for the iterations after `first`, up to and including `last`.
-
-    Each batch depends only on its number.
-    """
+    """Load the batches, each by its number alone, for the iterations after `first`, up to and including `last`."""
     size = training.batch
     workers = min(8, len(os.sched_getaffinity(0)) - 1) if torch.cuda.is_available() else 0
     return DataLoader(pairs, size, sampler=range(first * size, last * size), num_workers=workers)
@@ -261,20 +237,9 @@ def _on(batch: Batch, device: torch.device) -> Batch:
 def _resumed(
     out: Path, training: Training, network: Network, *parts: Any
 ) -> tuple[int, list[list[float]], list[float]]:
-    """Restore the weights, the optimizer and the learning rate from a training run's checkpoint.
-
-    Args:
-        out: Folder that contains the checkpoint.
-        training: Settings, which must equal those in the checkpoint.
-        network: Network that receives the weights.
-        *parts: Optimizer and learning rate scheduler whose states are to be restored.
-
-    Returns:
-        The number of completed iterations, the learning curve, and the light PSNR of every iteration since the curve's
-        last point.
-
-    Raises:
-        InputError: The checkpoint is invalid or has different settings.
+    """Restore weights, optimizer and learning rate (`parts`) from a checkpoint in a folder, made with equal settings.
+    Return the number of completed iterations, the learning curve, and the light PSNR of every iteration since the
+    curve's last point. Raises InputError if the checkpoint is invalid or has different settings.
     """
     path = out / "checkpoint.pth"
     table = load_checkpoint(path)

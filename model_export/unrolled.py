@@ -13,10 +13,7 @@ from runtime.config import Section
 
 
 class Unrolled(nn.Module):
-    """Network whose only weights are the sizes and momenta of the solver steps that follow it.
-
-    The steps start from panels that share the mean picture equally.
-    """
+    """Network whose only weights are the sizes and momenta of its steps, from panels that share the mean picture."""
 
     class Options(Section):
         """The number of steps and their initial size."""
@@ -30,9 +27,8 @@ class Unrolled(nn.Module):
         self.step_momenta = nn.Parameter(torch.full((steps,), MOMENTUM))
 
     def forward(self, eyes: Tensor) -> Tensor:
-        """Map intensities (n, 6, h, w) to panel values (n, 9, h, w) that are equal for all panels.
-
-        Each panel value is a third of the phase sum, between 1 and 2, that shows the mean picture.
+        """Map intensities (n, 6, h, w) to equal panel values (n, 9, h, w): a third of the phase sum, 1 to 2, of the
+        mean.
         """
         mean = (eyes[:, :3] + eyes[:, 3:]) / 2
         phase = torch.asin(mean.clamp(0, 1).sqrt()) * (2 / torch.pi)

@@ -79,16 +79,8 @@ def validate_file(path: Path) -> Report:
 
 
 def check_model(data: bytes, *, source: str, reference: Reference | None = None) -> Report:
-    """Check a model's results against a reference.
-
-    Args:
-        data: The ONNX file's contents.
-        source: Name of the file, used in the report.
-        reference: Function that computes the correct results, such as the torch module. Defaults to the graph run
-            without optimisations.
-
-    Raises:
-        InputError: The bytes are not an ONNX model, or the model has no valid contract.
+    """Check a model's results against a reference, such as the torch module, by default the unoptimised graph. Raises
+    InputError if the bytes are not an ONNX model, or the model has no valid contract.
     """
     try:
         model = onnx.load_from_string(data)
@@ -114,10 +106,7 @@ def check_model(data: bytes, *, source: str, reference: Reference | None = None)
 
 
 def _size(shape: Sequence[Any], contract: Contract) -> tuple[int, int]:
-    """Return the test pictures' height and width.
-
-    They are taken from the graph or the contract. If neither fixes a size, `SMALL` is used.
-    """
+    """Return the test pictures' height and width, from the graph or the contract, or else `SMALL`."""
     graph, given = (*shape[2:], None, None)[:2], (contract.height_px, contract.width_px)
     found = [g if isinstance(g, int) else c or s for g, c, s in zip(graph, given, SMALL, strict=True)]
     return found[0], found[1]
@@ -150,10 +139,8 @@ def _ports(session: onnxruntime.InferenceSession, contract: Contract) -> list[Ch
 
 
 def _panels(answer: Sequence[np.ndarray]) -> np.ndarray:
-    """Return a model's outputs as a vector of panel values, or as a single NaN if its check failed.
-
-    Integer outputs are in sixteenths of an 8-bit level, and floating-point outputs are panel values. A scalar output
-    that is not finite counts as a failed check.
+    """Return a model's outputs as a vector of panel values, or as a single NaN if a scalar output is not finite.
+    Integer outputs are in sixteenths of an 8-bit level.
     """
     if any(part.size == 1 and not np.isfinite(part).all() for part in answer):
         return np.full(1, np.nan, np.float32)

@@ -72,12 +72,8 @@ def request_of(message: Mapping[str, Any]) -> DrawingRequest:
 
 
 def found_address() -> str:
-    """Return the address for drawing programs of a running phasestack: the service, `run` or `try`.
-
-    If it shows another scene, it is told to show the scene `program`.
-
-    Raises:
-        TransientError: Nothing is running, or the scene does not start.
+    """Return the address for drawing programs of a running service, `run` or `try`, after selecting scene `program`
+    there. Raises TransientError if nothing is running, or the scene does not start.
     """
     tried = sorted(Path(tempfile.gettempdir()).glob("phasestack-*/status.sock"), key=_changed_s, reverse=True)
     own = [path for path in tried if path.exists() and path.stat().st_uid == os.getuid()]
@@ -104,20 +100,11 @@ def _changed_s(path: Path) -> float:
 
 
 class DrawingClient:
-    """Connection of an application that draws. It connects again by itself after it was lost.
-
-    `newest` and `answer` may be called on any thread. Neither waits.
-    """
+    """Connection of an application that draws, restored by itself. Neither method waits; both work on any thread."""
 
     def __init__(self, address: str, *, name: str) -> None:
-        """Start connecting.
-
-        Args:
-            address: The address that `phasestack status` shows, or an empty string to look for it.
-            name: The application's name in the log.
-
-        Raises:
-            InputError: The package websockets is not installed.
+        """Start connecting to an address, or "" to look for it; the log has `name`. Raises InputError without
+        websockets.
         """
         try:
             from websockets.sync import client
@@ -139,14 +126,7 @@ class DrawingClient:
         return request
 
     def answer(self, request: DrawingRequest, eye: EyeRequest, pixels: U8, depth: F32) -> None:
-        """Send an eye's picture, with the bottom row first. Does nothing if the connection was lost.
-
-        Args:
-            request: The frame's request.
-            eye: The eye that was drawn for.
-            pixels: RGBA (height_px, width_px, 4).
-            depth: (height_px, width_px) values of the depth buffer, 0-1, where 1 is the background.
-        """
+        """Send an eye's RGBA picture and depth buffer (0-1, 1: background), bottom row first, unless disconnected."""
         head, parts = HEAD.pack(request.number, eye.side), (pixels, depth.astype("<f4", copy=False))
         memory, socket = self._memory, self._socket
         if socket is None:

@@ -58,10 +58,7 @@ Cameras = Sequence[Sequence[Sequence[float]]] | Sequence[F64] | F64
 
 @dataclass(frozen=True)
 class _Pair:
-    """A call's validated arguments.
-
-    The pictures are views from pinhole eyes that look at the stack's origin.
-    """
+    """A call's validated arguments. The pictures are views from pinhole eyes that look at the stack's origin."""
 
     pictures: tuple[Picture, ...]
     eyes_m: F64
@@ -88,9 +85,8 @@ class Solving(TypedDict, total=False):
 
 
 class Result:
-    """The layers computed for pictures, one for each eye.
-
-    The result can also show what each eye sees of the layers, measure the quality, and save everything to files.
+    """The layers computed for pictures, one for each eye. The result can also show what each eye sees of the layers,
+    measure the quality, and save everything to files.
     """
 
     layers: U8  # (panels, h, w, 3), rear to front
@@ -108,20 +104,15 @@ class Result:
 
     @property
     def quality(self) -> PairQuality:
-        """Quality of what the eyes see, compared with the pictures they should see.
-
-        The quality is measured on first access, which may take longer than solving. A warning is issued for each known
-        reason of ghosts.
+        """Quality of what the eyes see, measured on first access, which may take longer than solving. A warning is
+        issued for each known reason of ghosts.
         """
         self._warn()
         return self._pair.quality
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
-        """Warnings that the eyes will see ghosts, and why if it is known.
-
-        A reason is that the pictures have too much disparity for the stack, which is checked for two pictures.
-        """
+        """Warnings that the eyes will see ghosts, such as from too much disparity of two pictures for the stack."""
         if self._doubts:
             return self._doubts
         every = max(1, min(NOTED_EVERY, min(self._asked.pictures[0].shape[:2]) // EVERY_LEAST))
@@ -140,13 +131,8 @@ class Result:
         )
 
     def measure(self, **how: Unpack[Measuring]) -> PairQuality:
-        """Measure the quality, with options to make it faster, such as `measure(sigmas_mm=(1,), every=4)`.
-
-        Args:
-            **how: Options defined in `Measuring`, as for `evaluate`.
-
-        Raises:
-            ValueError: An option is out of range. The message names the option.
+        """Measure the quality with options of `evaluate`, such as `measure(sigmas_mm=(1,), every=4)`. Raises
+        ValueError, which names the option, if one is out of range.
         """
         self._warn()
         return _measured(self._pair, how)
@@ -170,10 +156,8 @@ class Result:
         return line + f"PSNR with one ray per pixel, as published: {self._pair.quality.psnr_db:.1f} dB"
 
     def show(self) -> Path:
-        """Open a browser page that shows the layers and the eyes' views.
-
-        Returns:
-            The path to the HTML file. The file is temporary, but is not deleted automatically.
+        """Open a browser page of the layers and the eyes' views, and return its temporary HTML file, which is not
+        deleted.
         """
         path = Path(tempfile.mkdtemp(prefix="phasestack-")) / "viewer.html"
         path.write_text(self._pair.viewer([self._line, *self.notes]), encoding="utf-8")
@@ -186,10 +170,7 @@ class Result:
         return f'<iframe srcdoc="{page}" style="width: 100%; height: 640px; border: 0"></iframe>'
 
     def save(self, out: str | Path) -> None:
-        """Write the layers, the eyes' views, a contact sheet, a viewer page and solve.json to a folder.
-
-        The files are the same as those written by `phasestack solve --out`.
-        """
+        """Write the files of `phasestack solve --out` to a folder."""
         told: dict[str, Any] = {"model": self.model, "eye_sigma_mm": self.eye_sigma_mm, "notes": self.notes}
         told["total_ms"] = round(self.total_ms, 3)
         try:
@@ -394,12 +375,7 @@ def _on_real_panels(pair: _Pair, layers: U8, panels: RealPanels, how: Measuring)
 
 
 def _measured(pair: SolvedPair, how: Measuring) -> PairQuality:
-    """Measure all quality figures, or only those requested by the options.
-
-    Raises:
-        TypeError: An option does not exist.
-        ValueError: An option is out of range. The message names the option.
-    """
+    """Measure all or the requested figures. Raises TypeError for an unknown option, ValueError for its value."""
     if unknown := sorted(how.keys() - Measuring.__annotations__.keys()):
         raise TypeError(f"{unknown[0]}: unknown argument; use {' or '.join(Measuring.__annotations__)}")
     if not how:
@@ -421,17 +397,11 @@ def _options(pictures: Sequence[Picture], how: Measuring) -> tuple[list[float], 
 
 
 def camera(eye_m: Sequence[float] | F64, *, width_px: int, height_px: int, fov_deg: float = 40.0) -> F64:
-    """Return the 3x4 matrix of the pinhole camera that `solve` assumes at an eye by default.
+    """Return the 3x4 matrix of the pinhole camera that `solve` assumes by default at an eye in `stack`.
 
     The camera looks at the stack's origin, and its pixel rows are parallel to the ground. The matrix maps homogeneous
     metres in the `stack` frame to homogeneous pixels; their third coordinate is the distance along the gaze, in metres.
-
-    Args:
-        eye_m: The eye's position in metres, in the `stack` frame.
-        fov_deg: Horizontal field of view, in degrees.
-
-    Raises:
-        ValueError: An argument is invalid. The message begins with the argument's name.
+    Raises ValueError, which begins with an argument's name.
     """
     sizes = {"width_px": width_px, "height_px": height_px}
     for name, size in sizes.items():
@@ -446,18 +416,8 @@ def camera(eye_m: Sequence[float] | F64, *, width_px: int, height_px: int, fov_d
 def project(
     points_m: ArrayLike, *, eye_m: Sequence[float] | F64, width_px: int, height_px: int, fov_deg: float = 40.0
 ) -> F64:
-    """Project points to pixels in an eye's picture.
-
-    Args:
-        points_m: Points (..., 3) in metres, in the `stack` frame.
-        eye_m: The eye's position in metres, in the `stack` frame.
-        fov_deg: Horizontal field of view, in degrees.
-
-    Returns:
-        Pixel coordinates (..., 2), or NaN for points behind the eye.
-
-    Raises:
-        ValueError: An argument is invalid. The message begins with the argument's name.
+    """Project points (..., 3) in `stack` to pixels (..., 2) of an eye's picture, NaN behind the eye. `fov_deg` is
+    horizontal. Raises ValueError, which begins with an argument's name.
     """
     points = as_numbers("points_m", points_m, "must be numbers in metres")
     if points.ndim < 1 or points.shape[-1] != 3:
@@ -469,10 +429,8 @@ def project(
 
 
 def _named(left: Any, right: Any) -> dict[str, Any]:
-    """Return the given pictures by the names to use in error messages.
-
-    Raises:
-        ValueError: The pictures are not a sequence, or there are too few or too many.
+    """Return the given pictures by the names to use in error messages. Raises ValueError for no sequence or their
+    number.
     """
     if right is not None:
         return {"left": left, "right": right}
@@ -492,11 +450,7 @@ def _checked(
     fov_deg: float,
     cameras: Cameras | None,
 ) -> _Pair:
-    """Validate the arguments of `solve`, and resample pictures taken by other cameras.
-
-    Raises:
-        ValueError: An argument is invalid, or an eye sees no part of the display. The message names the argument.
-    """
+    """Validate the arguments of `solve`, and resample pictures taken by other cameras. Raises ValueError."""
     given = _named(left, right)
     first, *_ = given
     pictures = [as_picture(name, picture) for name, picture in given.items()]
@@ -562,12 +516,7 @@ def _whole(name: str, value: Any, most: int) -> int:
 
 
 def _eyes(eyes_m: Any, stack: PanelStack, *, count: int) -> F64:
-    """Return the eyes as a (count, 3) array.
-
-    Raises:
-        ValueError: The eyes are not `count` points with three finite numbers each, are too far away, are not in front
-            of the panels, or are too close together.
-    """
+    """Return the eyes (count, 3). Raises ValueError if they are not finite points in front, apart and near enough."""
     points = "two points" if count == 2 else f"{count} points, one for each picture,"
     eyes = as_numbers("eyes_m", eyes_m, f"must be {points} of three numbers in metres")
     if eyes.shape != (count, 3) or not np.isfinite(eyes).all():

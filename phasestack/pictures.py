@@ -21,16 +21,8 @@ OVERSHOOT = 0.3  # how far resampled values may lie outside the range, as a frac
 
 
 def as_picture(name: str, given: Any) -> Picture:
-    """Convert a picture to an (h, w, 3) array of uint8, or of float32 in [0, 1].
-
-    An alpha channel is composited over white.
-
-    Args:
-        name: Name of the caller's argument, used in error messages.
-        given: An array, a tensor, or a Pillow image in any mode.
-
-    Raises:
-        ValueError: The shape, dtype or values are not those of a picture. The message suggests a conversion.
+    """Convert an array, a tensor, or a Pillow image to (h, w, 3) uint8, or float32 in [0, 1], over white. Raises
+    ValueError, which suggests a conversion, if the shape, dtype or values of `name` do not fit.
     """
     picture: Any = _from_pillow(name, given) if hasattr(given, "getbands") else as_array(name, given)
     if picture.ndim != 3 or picture.shape[2] not in (3, 4) or min(picture.shape[:2]) < LEAST_PX:
@@ -56,11 +48,7 @@ def as_picture(name: str, given: Any) -> Picture:
 
 
 def as_array(name: str, given: Any) -> Any:
-    """Convert an array, or a tensor on any device, to a NumPy array.
-
-    Raises:
-        ValueError: The value is a file name, or is not an array of numbers. The message begins with `name`.
-    """
+    """Convert an array, or a tensor on any device, to NumPy. Raises ValueError, which begins with `name`."""
     if isinstance(given, str | os.PathLike):
         raise ValueError(
             f"{name}: must be a picture, not a file name; read it with PIL.Image.open({os.fspath(given)!r})"
@@ -82,11 +70,7 @@ def as_array(name: str, given: Any) -> Any:
 
 
 def as_numbers(name: str, given: Any, told: str) -> F64:
-    """Convert numbers, or tensors on any device, to a float64 array.
-
-    Raises:
-        ValueError: The value does not consist of numbers. The message is `name` and `told`.
-    """
+    """Convert numbers, or tensors on any device, to float64. Raises ValueError, `name` and `told`, for others."""
     try:
         return np.asarray(_detached(given), np.float64)
     except (TypeError, ValueError, RuntimeError):
@@ -104,10 +88,7 @@ def _is_tensor(given: Any) -> bool:
 
 
 def _from_pillow(name: str, image: Any) -> U8:
-    """Convert a Pillow image to sRGB, rotated according to its EXIF orientation.
-
-    Palettes, CMYK and embedded colour profiles are converted. Raises ValueError if the image cannot be decoded.
-    """
+    """Convert any Pillow image, with its colour profile, to upright sRGB. Raises ValueError if that fails."""
     try:
         return rgb_of(image, name)
     except InputError as error:
@@ -156,17 +137,8 @@ def as_codes(picture: Picture) -> U8:
 
 
 def find_eyes(picture: ArrayLike) -> Pupils | None:
-    """Find the nearest viewer's pupils in a picture.
-
-    Args:
-        picture: Array (h, w, 3 or 4) of uint8 or of floats in 0..1, or a Pillow image.
-
-    Returns:
-        The pupils, or None if the picture shows no viewer. `eyes_px` is a (2, 2) array of pixel coordinates, with pixel
-        centres at half-integers. The viewer's left eye comes first; in a picture that is not mirrored, it is on the
-        right. `sigma_px` is the standard deviation of each coordinate.
-
-    Raises:
-        ValueError: The argument is not a picture.
+    """Find the nearest viewer's pupils in a picture (h, w, 3 or 4), uint8 or floats in 0..1, or a Pillow image, or
+    None. `eyes_px` (2, 2) has pixel centres at half-integers and the viewer's left eye first, which is on the right
+    unless mirrored; `sigma_px` is each coordinate's standard deviation. Raises ValueError if there is no picture.
     """
     return pupils.find_eyes(as_codes(as_picture("picture", picture)))
