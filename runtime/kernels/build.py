@@ -27,7 +27,11 @@ class BuildKernels(build_ext):  # type: ignore[misc]
 
         def at_once(sources: list[str], **how: Any) -> list[str]:
             with ThreadPoolExecutor(os.cpu_count()) as pool:
-                return sum(pool.map(lambda source: compile_all([source], **how), sources), [])
+                return [
+                    made
+                    for objects in pool.map(lambda source: compile_all([source], **how), sources)
+                    for made in objects
+                ]
 
         ext.include_dirs = [nanobind.include_dir(), str(folder.parent / "ext/robin_map/include")]
         ext.sources = [*sources, str(folder / "nb_combined.cpp")]
