@@ -76,11 +76,19 @@ class SensorFrame:
 
     sequence: int  # frame number assigned by the device; a gap means lost frames
     capture_ns: int  # time of exposure, on the monotonic clock
-    eyes: EyePoints | None = None  # eyes in frame `sensor`; None: no face, or a sensor that does not find eyes
+    eyes: EyePoints | None = None  # nearest person, frame `sensor`; None: no face, or a sensor that does not find eyes
     colour: U8 | None = None  # (h, w, 3) RGB
     depth_mm: U16 | None = None  # (h, w), registered to the colour image where both exist; 0: no measurement
     intrinsics: Intrinsics | None = None  # intrinsics of the image that depth and colour are registered to
-    true_eyes_m: F64 | None = None  # (2, 3) true eyes in metres, in frame `stack`; None: no ground truth
+    # (2P, 3) true eyes of P people in metres, in frame `stack`, always in the same order of people; NaN: a person who
+    # is absent; None: no ground truth
+    true_eyes_m: F64 | None = None
+    others: tuple[EyePoints, ...] = ()  # further people, nearest first, in the same frame as `eyes`
+
+    @property
+    def people(self) -> tuple[EyePoints, ...]:
+        """All people's eyes, nearest first."""
+        return () if self.eyes is None else (self.eyes, *self.others)
 
 
 @dataclass(frozen=True, slots=True)

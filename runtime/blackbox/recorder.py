@@ -167,10 +167,12 @@ class Recorder(logging.Handler):
             logging.getLogger(name).addHandler(self)
 
     def sampled(self, sample: SensorFrame) -> None:
-        eyes, matrix = sample.eyes, self._sensor_from_stack
-        if eyes is not None and matrix is not None:
-            eyes_m = eyes.eyes_m @ matrix[:3, :3].T + matrix[:3, 3]
-            sample = replace(sample, eyes=replace(eyes, eyes_m=eyes_m, covariance_m2=None))
+        matrix = self._sensor_from_stack
+        if sample.eyes is not None and matrix is not None:
+            moved = (each.eyes_m @ matrix[:3, :3].T + matrix[:3, 3] for each in sample.people)
+            people = zip(sample.people, moved, strict=True)
+            first, *others = (replace(each, eyes_m=eyes_m, covariance_m2=None) for each, eyes_m in people)
+            sample = replace(sample, eyes=first, others=tuple(others))
         self._keep(fmt.EYES_TOPIC, fmt.eyes_message(sample), sample.sequence)
 
     def refreshed(self, refresh: Refresh) -> None:

@@ -90,11 +90,11 @@ class BrowserLink:
             taken, self._picture = self._picture, None
         return taken
 
-    def reporting(self, finder: Any) -> Callable[[SensorFrame], EyePoints | None]:
+    def reporting(self, finder: Any) -> Callable[[SensorFrame], tuple[EyePoints, ...]]:
         """Wrap an eye finder in a function that also sends the results to all pages."""
 
-        def find(frame: SensorFrame) -> EyePoints | None:
-            eyes: EyePoints | None = finder.find(frame)
+        def find(frame: SensorFrame) -> tuple[EyePoints, ...]:
+            eyes: tuple[EyePoints, ...] = finder.find_all(frame)
             if frame.colour is not None and self.news:
                 height, width = frame.colour.shape[:2]
                 size = (OVERLAY_PX, round(OVERLAY_PX * height / width))

@@ -32,6 +32,7 @@ RECORDING = ".mcap"
 OVERLAY_MIN_PX = 640  # an overlay's longer side has at least this many pixels
 PRIVATE = 0o600  # file mode for pictures that show faces
 GREEN, RED, WHITE = (60, 220, 60), (230, 60, 60), (255, 255, 255)
+MOST_PEOPLE = 4  # number of people to look for in a picture
 Row = dict[str, Any]
 
 
@@ -40,20 +41,23 @@ class Watcher:
 
     def __init__(self, settings: Settings) -> None:
         cv2.setNumThreads(1)  # like the display loop
-        self._finder = EyeFinder(settings)
+        self._finder = EyeFinder(settings, most_people=MOST_PEOPLE)
         self.forget = self._finder.forget
 
-    def look(self, frame: SensorFrame, file: str, number: int | None = None) -> tuple[Row, Pupils | None]:
+    def look(self, frame: SensorFrame, file: str, number: int | None = None) -> tuple[Row, list[Pupils]]:
         begin = time.perf_counter()
-        points = frame.eyes if frame.colour is None else self._finder.find(frame)
+        people = frame.people if frame.colour is None else self._finder.find_all(frame, is_still=number is None)
         ms = 1e3 * (time.perf_counter() - begin)
-        pupils, reason = self._finder.pupils, self._finder.reason
+        pupils, reason, points = self._finder.pupils, self._finder.reason, self._finder.points
         if pupils is not None and frame.intrinsics is None:
             reason = ""  # distances cannot be measured without intrinsics
+        others = self._finder.others_pupils
         if frame.colour is None:
-            pupils, reason = (
+            pupils, others, points, reason = (
                 None,
-                "this sensor delivers eye positions but no pictures" if points else "this sample contains no eyes",
+                [],
+                frame.eyes,
+                "this sensor delivers eye positions but no pictures" if people else "this sample contains no eyes",
             )
         row = {
             "file": file,
@@ -64,8 +68,9 @@ class Watcher:
             "ms": ms,
             "eyes_m": None if points is None else points.eyes_m.tolist(),
             "reason": reason,
+            "others_px": [other.eyes_px.tolist() for other in others],
         }
-        return row, pupils
+        return row, [*([] if pupils is None else [pupils]), *others]
 
 
 def look_at_files(
@@ -92,9 +97,9 @@ def look_at_files(
             target = None if folder is None else folder.staging / f"{place:03d}-{path.stem}"
             with _Overlays(target, is_still) as overlays:
                 for number, frame in enumerate(_frames(path, place, rate_hz)):
-                    row, pupils = watcher.look(frame, str(path), None if is_still else number)
+                    row, people = watcher.look(frame, str(path), None if is_still else number)
                     rows.append(row)
-                    overlays.add(frame, pupils, row)
+                    overlays.add(frame, people, row)
     return rows
 
 
@@ -143,10 +148,10 @@ class _Overlays:
         if self._film is not None:
             self._film.close()
 
-    def add(self, frame: SensorFrame, pupils: Pupils | None, row: Row) -> None:
+    def add(self, frame: SensorFrame, people: list[Pupils], row: Row) -> None:
         if self._target is None or frame.colour is None:
             return
-        picture = drawn(frame.colour, pupils, row)
+        picture = drawn(frame.colour, people, row)
         path = self._target.with_name(f"{self._target.name}.{'png' if self._is_still else 'mp4'}")
         path.touch(PRIVATE)
         if self._is_still:
@@ -159,7 +164,7 @@ class _Overlays:
         self._film.write(picture, time_ns=frame.capture_ns)
 
 
-def drawn(picture: U8, pupils: Pupils | None, row: Row) -> U8:
+def drawn(picture: U8, people: list[Pupils], row: Row) -> U8:
     """Return a copy of a picture, enlarged if small, with the pupils, face and figures drawn on it."""
     scale = max(1.0, OVERLAY_MIN_PX / max(picture.shape[:2]))
     canvas = np.asarray(cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC), np.uint8)
@@ -170,7 +175,7 @@ def drawn(picture: U8, pupils: Pupils | None, row: Row) -> U8:
         return int(x), int(y)
 
     line = f"no viewer: {row['reason']}"
-    if pupils is not None:
+    for pupils in people:
         for point in pupils.mesh_px[RIGID, :2]:
             cv2.circle(canvas, place(point), 1 << bits, WHITE, -1, cv2.LINE_AA, bits)
         for eye in pupils.eyes_px:
@@ -179,8 +184,9 @@ def drawn(picture: U8, pupils: Pupils | None, row: Row) -> U8:
             for off in ((1, 0), (0, 1)):
                 arm = np.array(off) * pupils.iris_px / 6
                 cv2.line(canvas, place(eye - arm), place(eye + arm), GREEN, 1, cv2.LINE_AA, bits)
+    if row["seen"] is not None:
         line = f"{row['seen']}, sigma {row['sigma_px']:.2f} px {row['reason']}"
-    for colour, width in ((0, 0, 0), 3), (RED if pupils is None else GREEN, 1):
+    for colour, width in ((0, 0, 0), 3), (GREEN if people else RED, 1):
         cv2.putText(canvas, line, (8, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, width, cv2.LINE_AA)
     return canvas
 
@@ -208,6 +214,6 @@ def look_at_sensor(
             while time.monotonic() < end:
                 with suppress(SensorTimeout):
                     frame = driver.read_newest(settings.sensor.timeout_s)
-                    row, pupils = watcher.look(frame, settings.sensor.driver, frame.sequence)
-                    overlays.add(frame, pupils, row)
+                    row, people = watcher.look(frame, settings.sensor.driver, frame.sequence)
+                    overlays.add(frame, people, row)
                     report(row)

@@ -45,7 +45,10 @@ def record(
     ] = None,
     motion: Annotated[
         str | None,
-        typer.Option(help="record a simulated head instead of the sensor (still, lean, nod, walk or stop-and-go)"),
+        typer.Option(
+            help="record a simulated head instead of the sensor (still, lean, nod, walk or stop-and-go), or two "
+            "(two-still, two-lean, two-one-leans, two-pass, two-exchange, two-leave or two-sit)"
+        ),
     ] = None,
     seed: Annotated[
         int | None, typer.Option(min=0, help="random seed for the head's path (only with --motion)")
@@ -139,7 +142,13 @@ def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | N
     from runtime.support import progress
 
     clock, s = MonotonicClock(), settings.sensor
-    worker = SensorWorker(lambda: open_sensor(s, clock), s, clock, lambda: EyeFinder(settings).find, keep_images=images)
+    worker = SensorWorker(
+        lambda: open_sensor(s, clock),
+        s,
+        clock,
+        lambda: EyeFinder(settings, most_people=settings.sought_people).find_all,
+        keep_images=images,
+    )
     max_s, stopped = seconds or MAX_S, "reached the time limit"
     writer, first_ns, so_far_s = None, 0, 0.0
     holds: dict[str, None] = {}

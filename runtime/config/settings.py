@@ -152,6 +152,9 @@ class SensorSettings(Section):
         return source
 
 
+TWO_VIEWERS_PANELS = 4  # minimum number of panels that serve two people well
+
+
 class TrackerSettings(Section):
     """The tracker, which follows the viewer's eyes."""
 
@@ -164,6 +167,14 @@ class TrackerSettings(Section):
         0.003,
         description="standard deviation of measured eye positions on each axis, until it has been measured, for "
         "sensors that do not report it",
+    )
+    viewers: Literal[1, 2, "auto"] = Field(
+        "auto",
+        description="number of people served at the same time (auto: two from four panels on, otherwise one; two on "
+        "three panels cost each person 8 to 10 dB)",
+    )
+    join_s: Annotated[float, within(0.0, 60.0, "s")] = Field(
+        1.0, description="time that a second person must stay in view before being served as well"
     )
 
 
@@ -440,6 +451,19 @@ class Settings(Section):
     loop: LoopSettings = LoopSettings()
     plan: PlanSettings = PlanSettings()
     service: ServiceSettings = ServiceSettings()
+
+    @property
+    def most_viewers(self) -> int:
+        """Number of people served at the same time: `tracker.viewers`, or as many as the panels serve well."""
+        if self.tracker.viewers != "auto":
+            return self.tracker.viewers
+        return 2 if len(self.stack.x_m) >= TWO_VIEWERS_PANELS else 1
+
+    @property
+    def sought_people(self) -> int:
+        """Number of people to look for in pictures: those served, and one who may pass between them."""
+        return self.most_viewers + 1 if self.most_viewers > 1 else 1
+
     pose: PoseSettings = PoseSettings()
 
     @model_validator(mode="after")

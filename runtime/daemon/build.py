@@ -177,8 +177,8 @@ def build_run(
         return open_sensor(sensor, clock, latency_ms=settings.loop.sensor_latency_ms)
 
     def make_find() -> FindEyes:
-        finder = EyeFinder(settings)
-        return finder.find if options.browser is None else options.browser.reporting(finder)
+        finder = EyeFinder(settings, most_people=settings.sought_people)
+        return finder.find_all if options.browser is None else options.browser.reporting(finder)
 
     driver = make_driver()
     samples: Samples

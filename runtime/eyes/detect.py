@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from runtime.clock import NS_PER_S
 from runtime.config import Settings
 from runtime.eyes.face_depth import EyeDepths, FaceDepth
+from runtime.eyes.liveness import Sign
 from runtime.eyes.pupils import SIDES, PupilFinder, Pupils
 from runtime.records import F64, EyePoints, Intrinsics, SensorFrame
 
@@ -17,6 +19,7 @@ from runtime.records import F64, EyePoints, Intrinsics, SensorFrame
 # independent, but their vertical errors are the same.
 MIDDLE_SIDEWAYS, MIDDLE_UP = 0.55, 1.1
 RANGE_MAX_M = 4.0  # a face farther away than this is not a viewer
+SEARCH_NS = NS_PER_S // 2  # time between two searches for further people
 LOCK_NS = NS_PER_S  # a viewer unseen for this long is replaced; a passer-by blocks the view for less time
 FILLED_IN_CONFIDENCE = 0.4  # confidence in a hidden eye with an inferred position
 
@@ -24,44 +27,109 @@ log = logging.getLogger(__name__)
 
 
 class EyeFinder:
-    """Finder that locates one viewer's eyes in camera pictures and ignores other people.
+    """Finder that locates people's eyes in camera pictures.
+
+    `find` follows one viewer and ignores other people. `find_all` follows as many people as `most_people`.
 
     Attributes:
         choice: Description of how the viewer was chosen.
-        reason: Why no eyes were found in the last frame, or an empty string.
-        pupils: Pupils found in the last frame, even if their distance is unknown. None if there were none.
+        reason: Why no eyes of the viewer were found in the last frame, or an empty string.
+        pupils: The viewer's pupils found in the last frame, even if their distance is unknown. None if there were none.
     """
 
-    def __init__(self, settings: Settings | None = None) -> None:
+    def __init__(self, settings: Settings | None = None, *, most_people: int = 1) -> None:
         """Create a finder. `settings.calibration` may have the viewer's eye separation."""
         settings = settings or Settings()
-        self._new_depth = partial(FaceDepth, eye_distance_m=settings.calibration.ipd_m)
-        self._finder = PupilFinder(lock_ns=LOCK_NS)
-        self._depth, self._viewer = self._new_depth(), 0
-        self.reason = ""
-        self.pupils: Pupils | None = None
+        new_depth = partial(FaceDepth, eye_distance_m=settings.calibration.ipd_m)
+        self._first = _Follower(PupilFinder(lock_ns=LOCK_NS), new_depth)
+        finders = (PupilFinder(lock_ns=LOCK_NS, shares=self._first.finder) for _ in range(most_people - 1))
+        self._others = [_Follower(finder, new_depth) for finder in finders]
+        self._searched_ns = -SEARCH_NS  # when a free follower last searched a picture
 
     def forget(self) -> None:
-        """Forget the viewer. The next frame is treated as the first one."""
-        self._finder.forget()
+        """Forget all people. The next frame is treated as the first one."""
+        for follower in (self._first, *self._others):
+            follower.finder.forget()
+        self._searched_ns = -SEARCH_NS
 
     @property
     def choice(self) -> str:
-        return self._finder.choice
+        return self._first.finder.choice
+
+    @property
+    def reason(self) -> str:
+        return self._first.reason
+
+    @property
+    def pupils(self) -> Pupils | None:
+        return self._first.pupils
+
+    @property
+    def points(self) -> EyePoints | None:
+        """The viewer's eyes in the last frame."""
+        return self._first.points
+
+    @property
+    def others_pupils(self) -> list[Pupils]:
+        """Pupils of the further people found by `find_all` in the last frame."""
+        return [follower.pupils for follower in self._others if follower.pupils is not None]
 
     def find(self, frame: SensorFrame) -> EyePoints | None:
         """Return the viewer's eyes in the sensor frame, or return None and store the cause in `reason`. The sample
         needs colour and intrinsics; depth, if any, must be registered to colour.
         """
+        return self._first.find(frame, taken=self._faces_except(self._first))
+
+    def find_all(self, frame: SensorFrame, *, is_still: bool = False) -> tuple[EyePoints, ...]:
+        """Return all people's eyes, nearest first, in the sensor frame.
+
+        Apart from the viewer, a face counts as a person only once it has moved or blinked.
+
+        Args:
+            frame: Sample as for `find`.
+            is_still: True for a picture without predecessors, in which no face can show signs of life.
+        """
+        found = [self.find(frame)]
+        for follower in self._others:
+            if follower.finder.is_free:
+                if not is_still and frame.capture_ns - self._searched_ns < SEARCH_NS:
+                    follower.pupils = None
+                    continue
+                self._searched_ns = frame.capture_ns
+            points = follower.find(frame, taken=self._faces_except(follower))
+            if is_still or follower.finder.has_lived:
+                found.append(points)
+        return tuple(sorted((points for points in found if points is not None), key=_range_m))
+
+    def _faces_except(self, follower: _Follower) -> list[Sign]:
+        others = (other.finder.sign for other in (self._first, *self._others) if other is not follower)
+        return [sign for sign in others if sign is not None]
+
+
+class _Follower:
+    """Finds one person's eyes from frame to frame."""
+
+    def __init__(self, finder: PupilFinder, new_depth: Callable[[], FaceDepth]) -> None:
+        self.finder, self._new_depth = finder, new_depth
+        self._depth, self._viewer = new_depth(), 0
+        self.reason = ""  # why no eyes were found in the last frame
+        self.pupils: Pupils | None = None
+        self.points: EyePoints | None = None
+
+    def find(self, frame: SensorFrame, *, taken: Sequence[Sign]) -> EyePoints | None:
+        self.points = self._found(frame, taken)
+        return self.points
+
+    def _found(self, frame: SensorFrame, taken: Sequence[Sign]) -> EyePoints | None:
         self.pupils = None
         if frame.colour is None:
             self.reason = "the sensor does not deliver colour pictures"
             return None
-        self.pupils = pupils = self._finder.find(frame.colour, time_ns=frame.capture_ns)
-        if self._finder.viewer != self._viewer:
-            log.info("viewer: %s", self.choice)
-            self._depth, self._viewer = self._new_depth(), self._finder.viewer
-        self.reason = self._finder.reason
+        self.pupils = pupils = self.finder.find(frame.colour, time_ns=frame.capture_ns, taken=taken)
+        if self.finder.viewer != self._viewer:
+            log.info("viewer: %s", self.finder.choice)
+            self._depth, self._viewer = self._new_depth(), self.finder.viewer
+        self.reason = self.finder.reason
         if pupils is None or frame.intrinsics is None:
             self.reason = self.reason or "the distance of the eyes is unknown because the camera reports no intrinsics"
             return None
@@ -76,6 +144,10 @@ class EyeFinder:
             self.reason = f"the face is {depths.eyes_m.mean():.1f} m away, but the maximum is {RANGE_MAX_M:g} m"
             return None
         return _eye_points(pupils, depths, frame.intrinsics)
+
+
+def _range_m(points: EyePoints) -> float:
+    return float(np.linalg.norm(points.eyes_m.mean(axis=0)))
 
 
 def _eye_points(pupils: Pupils, depths: EyeDepths, intrinsics: Intrinsics) -> EyePoints:

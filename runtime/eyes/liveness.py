@@ -40,12 +40,17 @@ class Liveness:
 
     def begin(self) -> None:
         """Begin with another viewer."""
+        self.has_lived = False  # True once the viewer has moved or blinked
         self._anchor: Sign | None = None
         self._anchor_ns = self._looked_ns = 0
         self._others: list[Sign] = []
 
     def is_due(self, viewer: Sign, time_ns: int) -> bool:
         """Take the viewer's latest sign, and return True if it is time to look for somebody else."""
+        if self._anchor is not None and (viewer.is_blinking or viewer.apart(self._first) > ALIVE):
+            self.has_lived = True
+        elif self._anchor is None:
+            self._first = viewer
         if self._anchor is None or viewer.is_blinking or viewer.apart(self._anchor) > STILL:
             self._anchor, self._anchor_ns, self._others = viewer, time_ns, []
         if time_ns - self._anchor_ns < STILL_NS or time_ns - self._looked_ns < LOOKED_NS:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from runtime.clock import NS_PER_S
 from runtime.records import F64, EyePoints
@@ -115,11 +116,20 @@ def true_eyes(motion: str, times_s: F64, *, path: Path = BENCHMARK_PATH) -> F64:
     c, s = np.cos(pitch), np.sin(pitch)
     middle = neck + np.stack([forward * c + up * s, np.zeros_like(c), up * c - forward * s], 1)
     middle += np.array([DISTANCE_M - forward, 0.0, -up])
-    # The head keeps facing the display and tilts as it leans.
-    yaw, roll = np.arctan2(middle[:, 1], middle[:, 0]), -0.6 * neck[:, 1]
+    return facing_eyes(middle, roll=-0.6 * neck[:, 1])  # the head tilts as it leans
+
+
+def facing_eyes(middle_m: F64, *, roll: F64) -> F64:
+    """Return the (n, 2, 3) eyes of heads that face the display.
+
+    Args:
+        middle_m: (n, 3) midpoints of the eyes, in frame `stack`.
+        roll: (n,) tilts of the heads in radians.
+    """
+    yaw = np.arctan2(middle_m[:, 1], middle_m[:, 0])
     across = [-np.sin(yaw) * np.cos(roll), np.cos(yaw) * np.cos(roll), np.sin(roll)]
     half = IPD_M / 2 * np.stack(across, 1)
-    return np.stack([middle - half, middle + half], 1)
+    return np.stack([middle_m - half, middle_m + half], 1)
 
 
 def observe(
@@ -139,18 +149,34 @@ def observe(
     """
     random = np.random.default_rng([seed, *motion.encode(), round(rate_hz)])
     times_s = np.arange(round(seconds * rate_hz)) / rate_hz
-    eyes = true_eyes(motion, times_s, path=path) + random.normal(0.0, noise_m, (len(times_s), 2, 3))
-    wrong = random.random(len(times_s)) < outliers
-    direction = random.normal(size=(len(times_s), 3))
-    offset = direction / np.linalg.norm(direction, axis=1, keepdims=True) * random.uniform(0.04, 0.2, (len(times_s), 1))
-    which = random.integers(0, 3, len(times_s))  # 0 left, 1 right, 2 both
-    for eye in (0, 1):
-        hit = wrong & ((which == eye) | (which == 2))
-        eyes[hit, eye] += offset[hit]
-    every_s = dropout_every_s or np.inf
-    missing = (times_s > 1.0) & (np.mod(times_s, every_s) >= every_s - DROPOUT_S)
+    eyes = measured(true_eyes(motion, times_s, path=path), random, noise_m=noise_m, outliers=outliers)
+    missing = dropouts(times_s, every_s=dropout_every_s)
     confidence = np.ones(2)
     return [
         Observation(round(t * NS_PER_S), None if gone else EyePoints(pair, confidence))
         for t, pair, gone in zip(times_s, eyes, missing)
     ]
+
+
+def measured(true_m: F64, random: np.random.Generator, *, noise_m: float, outliers: float) -> F64:
+    """Return (n, 2, 3) true eyes with the sensor's noise and outliers (`observe`)."""
+    count = len(true_m)
+    eyes = true_m + random.normal(0.0, noise_m, (count, 2, 3))
+    wrong = random.random(count) < outliers
+    direction = random.normal(size=(count, 3))
+    offset = direction / np.linalg.norm(direction, axis=1, keepdims=True) * random.uniform(0.04, 0.2, (count, 1))
+    which = random.integers(0, 3, count)  # 0 left, 1 right, 2 both
+    for eye in (0, 1):
+        hit = wrong & ((which == eye) | (which == 2))
+        eyes[hit, eye] += offset[hit]
+    return eyes
+
+
+def dropouts(times_s: F64, *, every_s: float) -> NDArray[np.bool_]:
+    """Return, for each of (n,) times, True if the sensor sees no face.
+
+    Args:
+        every_s: Time between dropouts. If 0, there are none.
+    """
+    every_s = every_s or np.inf
+    return np.asarray((times_s > 1.0) & (np.mod(times_s, every_s) >= every_s - DROPOUT_S))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Literal
@@ -108,9 +108,15 @@ class PupilFinder:
         choice: Description of how the viewer was chosen.
     """
 
-    def __init__(self, *, lock_ns: int = 0) -> None:
-        """Create a finder. After `lock_ns`, a viewer who is no longer seen may be replaced by another person."""
-        self._faces, self._meshes, self._irises = FaceNetwork(), MeshNetwork(), IrisNetwork()
+    def __init__(self, *, lock_ns: int = 0, shares: PupilFinder | None = None) -> None:
+        """Create a finder. After `lock_ns`, a viewer who is no longer seen may be replaced by another person.
+
+        Args:
+            shares: Finder of another person whose networks to use.
+        """
+        networks = None if shares is None else (shares._faces, shares._meshes, shares._irises)
+        self._faces, self._meshes, self._irises = networks or (FaceNetwork(), MeshNetwork(), IrisNetwork())
+        self._taken: Sequence[Sign] = ()
         self._flow, self._lock_ns = FaceFlow(), lock_ns
         self.viewer = self._found_count = 0
         self.forget()
@@ -130,8 +136,25 @@ class PupilFinder:
         self._seen_ns = 0
         self.reason, self.choice = "", "no viewer yet"
 
-    def find(self, picture: U8, *, time_ns: int = 0) -> Pupils | None:
-        """Return the viewer's pupils in an RGB picture of `time_ns`, or None and store the cause in `reason`."""
+    @property
+    def sign(self) -> Sign | None:
+        """The viewer's face in the last picture; None if it was not seen."""
+        return None if self._last is None else self._last.sign
+
+    @property
+    def has_lived(self) -> bool:
+        """True once the viewer has moved or blinked, which a picture on a wall does not."""
+        return self._liveness.has_lived
+
+    @property
+    def is_free(self) -> bool:
+        """True if no viewer is followed or remembered."""
+        return self._looks is None
+
+    def find(self, picture: U8, *, time_ns: int = 0, taken: Sequence[Sign] = ()) -> Pupils | None:
+        """Return the viewer's pupils in an RGB picture of `time_ns`, or None and store the cause in `reason`. Faces in
+        `taken` are left to other finders."""
+        self._taken = taken
         if self._looks is not None and time_ns - self._seen_ns > self._lock_ns:
             self._leave()
             self.choice = "the viewer has left"
@@ -162,7 +185,13 @@ class PupilFinder:
         if presence < PRESENCE_FOLLOWED:
             return None
         look = self._measured(picture, mesh, presence)
+        if self._is_taken(look):
+            return None
         return look if look.looks @ self._looks > SAME_LOOKS_FOLLOWED else None
+
+    def _is_taken(self, look: _Look) -> bool:
+        """Return True if a face is one of those left to other finders."""
+        return any(look.sign.apart(other) < NEAR for other in self._taken)
 
     def _person(self, picture: U8, viewer: _Look) -> _Look | None:
         """Return somebody other than the viewer who has moved or blinked since the previous call."""
@@ -175,6 +204,7 @@ class PupilFinder:
         faces: list[FoundFace] = []
         for longest_px in LEVELS_PX:
             faces = faces or self._faces.find(picture, longest_px=longest_px, score_min=SCORE_MIN)
+        faces = [face for face in faces if not any(_overlaps(face, other) for other in self._taken)]
         self._found_count = len(faces)
         middle = np.array(picture.shape[1::-1]) / 2
         faces.sort(key=lambda face: -_worth(face, middle))
@@ -182,8 +212,8 @@ class PupilFinder:
             mesh, presence = self._meshes.points(picture, face.square())
             if presence > PRESENCE_FOUND:
                 mesh, presence = self._meshes.points(picture, _square_of(mesh))
-            if presence >= PRESENCE_FOUND:
-                yield self._measured(picture, mesh, presence)
+            if presence >= PRESENCE_FOUND and not self._is_taken(look := self._measured(picture, mesh, presence)):
+                yield look
 
     def _search(self, picture: U8) -> _Look | None:
         """Search the whole picture for the viewer, or choose a new viewer if none is remembered."""
@@ -257,6 +287,11 @@ def _worth(face: FoundFace, middle: F64) -> float:
     """Return a face's score as a possible viewer: its size, reduced away from the picture's `middle` (2,)."""
     away = np.abs(face.box[:2] + face.box[2:] / 2 - middle) / middle
     return face.size * (1 - FARTHEST_OUT * float(np.linalg.norm(away) / np.sqrt(2)))
+
+
+def _overlaps(face: FoundFace, sign: Sign) -> bool:
+    """Return True if the midpoint between a person's pupils is in a found face's box."""
+    return bool((face.box[:2] < sign.middle).all() and (sign.middle < face.box[:2] + face.box[2:]).all())
 
 
 def _square_of(mesh: F64) -> Square:

@@ -22,6 +22,7 @@ POSITION_DIGITS = 7  # decimal places of a position in metres: 0.1 µm is far be
 JPEG_QUALITY = 92  # JPEG quality of recorded colour pictures
 NUMBER_MAX = 1 << 62  # the sum of two such numbers fits in 64 bits; 146 years in nanoseconds
 COORDINATE_MAX_M = 1e6  # beyond any sensor's range in any unit; the tracker checks plausibility
+PEOPLE_MOST = 16  # maximum number of people in a sample
 IMAGE_SIDE_MAX_PX = 1 << 15  # larger than any camera's pictures
 
 Count = Annotated[int, Field(ge=0, le=NUMBER_MAX)]
@@ -40,6 +41,17 @@ class Message(BaseModel):
     """Base class for messages. Numbers must be finite JSON numbers, not strings or booleans."""
 
     model_config = ConfigDict(strict=True, allow_inf_nan=False)
+
+
+class OtherEyes(Message):
+    """Eyes of a person other than the nearest. The fields are those of `EyeSample`."""
+
+    model_config = ConfigDict(title="phasestack.OtherEyes")
+
+    eyes_m: tuple[Point, Point]
+    confidence: tuple[Unit, Unit] = (1.0, 1.0)
+    covariance_m2: tuple[Row, Row, Row] | None = None
+    completed: Literal["", "left", "right"] = ""
 
 
 class EyeSample(Message):
@@ -62,6 +74,12 @@ class EyeSample(Message):
     )
     true_eyes_m: tuple[Point, Point] | None = Field(
         None, description="true eye positions in the `stack` frame, if known"
+    )
+    others: Annotated[list[OtherEyes], Field(max_length=PEOPLE_MOST - 1)] = Field(
+        [], description="further people, nearest first; `eyes_m` is then the nearest person"
+    )
+    others_true_eyes_m: Annotated[list[tuple[Point, Point]], Field(max_length=PEOPLE_MOST - 1)] = Field(
+        [], description="true eye positions of further people, always in the same order; null coordinates: absent"
     )
 
 
@@ -177,27 +195,45 @@ def _array(points: tuple[Point, Point] | None) -> F64 | None:
 def eyes_message(frame: SensorFrame) -> bytes:
     """Encode a sample's eye points as JSON. Non-finite coordinates become null."""
     record: dict[str, Any] = {"sequence": frame.sequence, "capture_ns": frame.capture_ns}
-    record["eyes_m"] = _points(frame.eyes.eyes_m if frame.eyes else None)
-    if frame.eyes is not None:
-        record["confidence"] = [round(float(c), 4) if np.isfinite(c) else 0.0 for c in frame.eyes.confidence]
-        if frame.eyes.completed:
-            record["completed"] = frame.eyes.completed
-        if frame.eyes.covariance_m2 is not None and np.isfinite(frame.eyes.covariance_m2).all():
-            record["covariance_m2"] = [[float(f"{x:.4g}") for x in row] for row in frame.eyes.covariance_m2]
+    record |= {"eyes_m": None} if frame.eyes is None else _person(frame.eyes)
     if frame.true_eyes_m is not None:
-        record["true_eyes_m"] = _points(frame.true_eyes_m)
+        record["true_eyes_m"] = _points(frame.true_eyes_m[:2])
+    if frame.eyes is not None and frame.others:
+        record["others"] = [_person(other) for other in frame.others[: PEOPLE_MOST - 1]]
+    if frame.true_eyes_m is not None and len(frame.true_eyes_m) > 2:
+        pairs = frame.true_eyes_m[2 : 2 * PEOPLE_MOST].reshape(-1, 2, 3)
+        record["others_true_eyes_m"] = [_points(pair) for pair in pairs]
     return json.dumps(record, separators=(",", ":"), allow_nan=False).encode()
+
+
+def _person(points: EyePoints) -> dict[str, Any]:
+    record: dict[str, Any] = {"eyes_m": _points(points.eyes_m)}
+    record["confidence"] = [round(float(c), 4) if np.isfinite(c) else 0.0 for c in points.confidence]
+    if points.completed:
+        record["completed"] = points.completed
+    if points.covariance_m2 is not None and np.isfinite(points.covariance_m2).all():
+        record["covariance_m2"] = [[float(f"{x:.4g}") for x in row] for row in points.covariance_m2]
+    return record
 
 
 def frame_from_eyes_message(data: bytes) -> SensorFrame:
     """Decode the result of `eyes_message`. Raises ValueError if the message is malformed."""
     sample = _read(EyeSample, data)
-    eyes_m, covariance_m2 = _array(sample.eyes_m), sample.covariance_m2
-    eyes = None
-    if eyes_m is not None:
-        covariance = None if covariance_m2 is None else np.array(covariance_m2)
-        eyes = EyePoints(eyes_m, np.array(sample.confidence), sample.completed, covariance)
-    return SensorFrame(sample.sequence, sample.capture_ns, eyes, true_eyes_m=_array(sample.true_eyes_m))
+    true_m = _array(sample.true_eyes_m)
+    if true_m is not None and sample.others_true_eyes_m:
+        true_m = np.concatenate([true_m, *(np.array(pair, np.float64) for pair in sample.others_true_eyes_m)])
+    eyes, others = _eyes(sample), tuple(filter(None, map(_eyes, sample.others)))
+    if eyes is None and others:
+        raise ValueError("others: must be empty because `eyes_m` is null")
+    return SensorFrame(sample.sequence, sample.capture_ns, eyes, true_eyes_m=true_m, others=others)
+
+
+def _eyes(person: EyeSample | OtherEyes) -> EyePoints | None:
+    eyes_m, covariance_m2 = _array(person.eyes_m), person.covariance_m2
+    if eyes_m is None:
+        return None
+    covariance = None if covariance_m2 is None else np.array(covariance_m2)
+    return EyePoints(eyes_m, np.array(person.confidence), person.completed, covariance)
 
 
 def _stamped(capture_ns: int, **values: Any) -> bytes:

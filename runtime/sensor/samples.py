@@ -11,7 +11,7 @@ from runtime.errors import EndOfRecording, InputError
 from runtime.records import EyePoints, SensorFrame
 from runtime.sensor.base import Sensor, SteppedSensor
 
-FindEyes = Callable[[SensorFrame], EyePoints | None]
+FindEyes = Callable[[SensorFrame], tuple[EyePoints, ...]]  # all people's eyes, nearest first
 AHEAD_NS = NS_PER_S // 10  # longer than the time from a sample's capture to the display of the refresh that uses it
 
 
@@ -54,7 +54,8 @@ def searched(frame: SensorFrame, find: FindEyes | None, *, keep_images: bool = F
         keep_images: Keep the pictures in the sample.
     """
     if find is not None:
-        frame = replace(frame, eyes=find(frame))
+        first, *others = find(frame) or (None,)
+        frame = replace(frame, eyes=first, others=tuple(others))
     return frame if keep_images else replace(frame, colour=None, depth_mm=None)
 
 

@@ -16,6 +16,7 @@ from runtime.errors import InputError
 from runtime.evaluation.motion_recording import write_motion
 from runtime.eyes.calibration import demo_stack_from_sensor
 from runtime.eyes.motions import MOTIONS, observe, path_of, true_eyes
+from runtime.eyes.two_people import MOTIONS_OF_TWO, true_eyes_of_two
 from runtime.sensor.recording import Recording
 
 app = typer.Typer()
@@ -88,3 +89,27 @@ def test_what_makes_no_sense_is_refused_by_name_and_leaves_nothing(tmp_path: Pat
     answer = CliRunner().invoke(app, [*how, "--out", str(tmp_path / "a.mcap")])
     assert isinstance(answer.exception, InputError) and names in str(answer.exception)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("motion", MOTIONS_OF_TWO)
+def test_two_people_are_recorded_nearest_first_each_where_they_are(tmp_path: Path, motion: str) -> None:
+    write_motion(tmp_path / "two.mcap", motion, seconds=11.0, noise_mm=0.0)
+    pose = demo_stack_from_sensor()
+    seen_together, off_m = 0, []
+    for sample in Recording(tmp_path / "two.mcap").samples():
+        assert sample.true_eyes_m is not None and sample.true_eyes_m.shape == (4, 3)
+        people = [person.eyes_m @ pose[:3, :3].T + pose[:3, 3] for person in sample.people]
+        true_m = sample.true_eyes_m.reshape(2, 2, 3)
+        seen_together += len(people) == 2
+        off_m += [np.nanmin([np.abs(eyes_m - pair).max() for pair in true_m]) for eyes_m in people]
+        if len(people) == 2 and max(off_m[-2:]) < 1e-5:  # an outlier may seem to be nearer
+            nearest, other = (np.linalg.norm(eyes_m.mean(axis=0)) for eyes_m in people)
+            assert nearest <= other + 1e-6
+    assert seen_together > 60 and np.mean(np.array(off_m) < 1e-5) > 0.9
+
+
+def test_two_people_never_touch() -> None:
+    times_s = np.arange(0.0, 24.0, 0.05)
+    for motion in MOTIONS_OF_TWO:
+        middles = true_eyes_of_two(motion, times_s).reshape(-1, 2, 2, 3).mean(axis=2)
+        assert np.nanmin(np.linalg.norm(middles[:, 0] - middles[:, 1], axis=1)) > 0.2

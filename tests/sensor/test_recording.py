@@ -45,6 +45,33 @@ def write(
         return [writer.write(frame) for frame in frames]
 
 
+def test_all_people_come_back_with_their_true_eyes(tmp_path: Path) -> None:
+    second = EyePoints(np.full((2, 3), 0.8), np.array([0.7, 1.0]), "left", np.diag([1e-6, 2e-6, 3e-6]))
+    absent = np.full((2, 3), np.nan)
+    truth = np.concatenate([absent, np.full((2, 3), 0.5)])
+    alone, both = sample(1, true_eyes_m=truth), sample(2, true_eyes_m=truth, others=(second,))
+    write(tmp_path / "two.mcap", [alone, both])
+    first, read = Recording(tmp_path / "two.mcap").samples()
+    assert first.others == () and len(read.people) == 2
+    np.testing.assert_allclose(read.true_eyes_m, truth)
+    (back,) = read.others
+    np.testing.assert_allclose(back.eyes_m, second.eyes_m)
+    np.testing.assert_allclose(back.covariance_m2, second.covariance_m2)
+    assert back.completed == "left" and back.confidence.tolist() == [0.7, 1.0]
+
+
+def test_a_sample_of_one_person_is_written_as_before() -> None:
+    assert "others" not in eyes_message(sample(1, true_eyes_m=np.zeros((2, 3)))).decode()
+
+
+def test_others_without_a_nearest_person_are_refused() -> None:
+    message = json.dumps(
+        {"sequence": 1, "capture_ns": 1, "eyes_m": None, "others": [{"eyes_m": [[0, 0, 1], [0, 0, 1]]}]}
+    )
+    with pytest.raises(ValueError, match="others"):
+        frame_from_eyes_message(message.encode())
+
+
 finite = st.floats(-10, 10)
 
 

@@ -43,7 +43,7 @@ def settings(source: str) -> SensorSettings:
 def test_without_depth_the_eyes_direction_is_right_with_sigma_along_it(film: str) -> None:
     sensor = settings(film)
     driver = open_sensor(sensor, MonotonicClock())
-    find = EyeFinder(Settings(sensor=sensor)).find
+    find = EyeFinder(Settings(sensor=sensor)).find_all
     with driver:
         frames = [searched(driver.read_newest(1.0), find) for _ in range(5)]
         with pytest.raises(SensorLost, match="stopped delivering pictures"):
