@@ -55,7 +55,7 @@ class Bundle:
     photograph: Any  # (K,) index of the photograph that shows each point
 
     def sigma_of(self, derived: Any) -> F64:
-        """Return the first-order standard deviation of an array that `derived` computes from a sequence of panels."""
+        """First-order standard deviation of an array that `derived` computes from a sequence of panels."""
         columns = []
         for number, step in enumerate(np.sqrt(np.diag(self.covariance)) * 0.1):
             up, down = (np.asarray(derived(self._stepped(number, signed))) for signed in (step, -step))
@@ -125,8 +125,8 @@ class _Problem:
         return np.asarray(seen.reshape(-1, 2) - self.image_px, dtype=np.float64)
 
     def residuals(self, state: _State) -> F64:
-        """Return a vector (2K + priors,) of `residual_px` and the lens's deviations from its prior, in standard
-        deviations.
+        """Return a vector (2K + priors,) of `residual_px` and the lens's deviations from its prior, in
+        standard deviations.
         """
         lens = state.lens
         prior = np.concatenate([[lens[0] - lens[1]], lens[2:4] - self.middle, lens[4:]]) * self.prior_scale
@@ -164,7 +164,7 @@ class _Problem:
         return _State(state.lens + step[:LENS], turns, middles_m, change @ state.poses)
 
     def start(self, *, reverse: bool = False) -> _State:
-        """Return ideal panels, maybe in reverse order, and the best of several focal lengths with its camera poses."""
+        """Return ideal panels, maybe in reverse order, and the best of several focal lengths with its poses."""
         count, origin_m = self.stack.count, self.stack.x_m[self.reference]
         middles_m = np.zeros((count, 3))
         middles_m[:, 0] = origin_m + (np.array(self.stack.x_m) - origin_m) * (-1 if reverse else 1)
@@ -239,9 +239,9 @@ def _median_px(problem: _Problem, state: _State) -> float:
 
 
 def adjust(seen: Sequence[SeenMarks], stack: PanelStack, *, reference: int) -> Bundle:
-    """Estimate every panel's pose from one camera's photographs of the boards, starting from the configured geometry.
-    `reference` is the panel that defines frame `stack`. Raises Undetermined if the panels are in reverse order, or the
-    photographs are too few or too similar.
+    """Estimate every panel's pose from one camera's photographs of the boards, starting from the
+    configured geometry. `reference` is the panel that defines frame `stack`. Raises Undetermined if the panels are in
+    reverse order, or the photographs are too few or too similar.
     """
     problem = _Problem(seen, stack, reference=reference)
     used = np.ones(len(problem.image_px), bool)

@@ -1,4 +1,4 @@
-"""Guide the user through the calibration viewpoints and store a pair of points for each (`calibrate capture`)."""
+"""Guide the user through the calibration viewpoints and store a pair of points for each."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class EyeWindow:
         self._samples: deque[tuple[int, F64]] = deque()  # capture time and midpoint between the eyes
 
     def add(self, capture_ns: int, eyes: EyePoints | None) -> None:
-        """Add a sample in the sensor frame, unless an eye is uncertain, and drop any more than half a second old."""
+        """Add a sample in the sensor frame, unless an eye is uncertain; drop any over half a second old."""
         middle = midpoint(eyes)
         if middle is not None:
             self._samples.append((capture_ns, middle))
@@ -52,8 +52,8 @@ class EyeWindow:
             self._samples.popleft()
 
     def measure(self) -> tuple[F64, float] | None:
-        """Return the median position (3,) in the sensor frame and the RMS scatter around it, in metres, or None if too
-        few.
+        """Return the median position (3,) in the sensor frame and the RMS scatter around it, in metres, or
+        None if too few.
         """
         if len(self._samples) < MIN_SAMPLES:
             return None
@@ -64,8 +64,8 @@ class EyeWindow:
 
 
 class Walk:
-    """Guide for a user who moves from viewpoint to viewpoint and accepts a pair of points at each. The caller supplies
-    samples and key presses; there are no clock and no threads here.
+    """Guide for a user who moves from viewpoint to viewpoint and accepts a pair of points at each. The
+    caller supplies samples and key presses; there are no clock and no threads here.
     """
 
     def __init__(
@@ -172,9 +172,9 @@ class Walk:
 def capture_live(
     out: Path, settings: Settings, hardware: SetupHardware, *, show: bool, say: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Guide the user through the viewpoints in front of the display, and add pairs to the CSV file `out`. `show` puts
-    the charts on the panels. Raises InputError for the file, the sensor or the panels, and FatalError if the sensor
-    failed permanently.
+    """Guide the user through the viewpoints in front of the display, and add pairs to the CSV file `out`.
+    `show` puts the charts on the panels. Raises InputError for the file, the sensor or the panels, and FatalError if
+    the sensor failed permanently.
     """
     file = PairsFile(out)
     say(f"sensor: {hardware.open_sensor(settings)}")
@@ -195,8 +195,8 @@ def capture_live(
 
 
 def capture_recording(out: Path, settings: Settings, *, source: str) -> dict[str, Any]:
-    """Write a pair for every sample in a recording, or `demo`, that includes the true eye positions, to the CSV file
-    `out`. Raises InputError if no sample has both the true eye positions and confidently measured eyes.
+    """Write a pair for every sample in a recording, or `demo`, that includes the true eye positions, to
+    the CSV file `out`. Raises InputError if no sample has both the true eye positions and confidently measured eyes.
     """
     chosen = settings.sensor.model_copy(update={"driver": "replay", "source": source, "loop": False})
     samples = RecordedSamples(open_sensor(chosen, SimulatedClock()))

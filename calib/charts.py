@@ -28,8 +28,9 @@ WIDEST_FOV_DEG = 40.0  # horizontal field of view of the eyes' images, as in the
 
 
 def chart_fov_deg(viewpoint: Viewpoint, stack: PanelStack) -> float:
-    """Return the horizontal field of view of the eyes' images at a viewpoint, in degrees. This is the published 40
-    degrees, or the angle that the display fills if that is smaller, so the lines are on the panels at any distance.
+    """Return the horizontal field of view of the eyes' images at a viewpoint, in degrees. This is the
+    published 40 degrees, or the angle that the display fills if that is smaller, so the lines are on the panels at any
+    distance.
     """
     return min(WIDEST_FOV_DEG, float(np.degrees(2 * np.arctan(stack.width_m / 2 / (viewpoint.radius_cm / 100)))))
 
@@ -69,7 +70,7 @@ class Charts:
 
 
 def make_charts(out: Path, viewpoints: Sequence[Viewpoint], settings: Settings) -> dict[str, Any]:
-    """Write the layers of each viewpoint's chart as PNG files, and `charts.json`. Raises as `Charts`, and for files."""
+    """Write each viewpoint's chart as PNG files, and `charts.json`. Raises as `Charts`, and for files."""
     charts = []
     with OutputFolder(out) as folder, closing(Charts(settings)) as drawn:
         for viewpoint in tracked("charts", viewpoints):

@@ -25,8 +25,8 @@ KEPT_BYTES_MAX = 64 << 20  # size limit for a file that is backed up
 
 
 def save(path: Path, text: str) -> Path | None:
-    """Write a file, or a symbolic link's target, atomically, and keep the version that it replaces. Return the numbered
-    path of the old version, with the same permissions, or None if the file is new.
+    """Write a file, or a symbolic link's target, atomically, and keep the version that it replaces.
+    Return the numbered path of the old version, with the same permissions, or None if the file is new.
     """
     path, kept = path.resolve(), None
     if untrusted_input.is_there(path):
@@ -57,8 +57,8 @@ def read_document(config: Path) -> TOMLDocument:
 
 
 def rewrite(config: Path, change: Callable[[TOMLDocument], None]) -> Path | None:
-    """Change a configuration's document in place, and return the old version's path, or None for a new file. If the
-    result is invalid, InputError is raised and the file stays unchanged.
+    """Change a configuration's document in place, and return the old version's path, or None for a new
+    file. If the result is invalid, InputError is raised and the file stays unchanged.
     """
     document = read_document(config)
     change(document)
@@ -76,7 +76,7 @@ def put(document: TOMLDocument, section: str, values: Mapping[str, Any]) -> None
 
 
 def put_panels(document: TOMLDocument, key: str, values: Mapping[int, Any], *, panels: int) -> None:
-    """Set a key, such as `lut`, in `[[output.panels]]` to values by panel index. Missing tables are created."""
+    """Set a key, such as `lut`, in `[[output.panels]]` by panel index. Missing tables are created."""
     output: Any = document.setdefault("output", tomlkit.table())
     if "panels" not in output:
         output["panels"] = tomlkit.aot()
@@ -87,8 +87,8 @@ def put_panels(document: TOMLDocument, key: str, values: Mapping[int, Any], *, p
 
 
 def put_monitors(document: TOMLDocument, tables: Sequence[Mapping[str, Any]]) -> None:
-    """Set every panel's monitor and mounting, rear to front. A panel whose monitor and mounting have not changed keeps
-    its registration and its grey curve.
+    """Set every panel's monitor and mounting, rear to front. A panel whose monitor and mounting have not
+    changed keeps its registration and its grey curve.
     """
     output: Any = document.setdefault("output", tomlkit.table())
     past = [dict(table.unwrap()) for table in output.get("panels", ())]

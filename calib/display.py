@@ -44,8 +44,9 @@ class PanelDisplay:
 
 
 def open_display(settings: Settings, *, registered: bool = False, grey_curve: bool = True) -> PanelDisplay:
-    """Open the configured panels, with each one's homography if `registered`, and its gamma or LUT if `grey_curve`.
-    Raises InputError for the settings, MissingPart without OpenGL or X11, and PanelLost without a monitor.
+    """Open the configured panels, with each one's homography if `registered`, and its gamma or LUT if
+    `grey_curve`. Raises InputError for the settings, MissingPart without OpenGL or X11, and PanelLost without a
+    monitor.
     """
     stack = settings.stack.stack()
     changes: dict[str, object] = {} if registered else {"homography": IDENTITY}

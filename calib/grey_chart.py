@@ -65,7 +65,7 @@ class Patch:
 
 @lru_cache(maxsize=8)
 def patches(stack: PanelStack, panel: int) -> tuple[Patch, ...]:
-    """Lay out the patches of a panel's chart between its board's marks, in a random order fixed for the panel."""
+    """Lay out the patches of a panel's chart between its board's marks, in random but fixed order."""
     pitch = stack.width_px // PATCHES_ACROSS
     side = pitch * 5 // 6 // 8 * 8  # so that the measured half contains whole periods of the mixing pattern
     free = [
@@ -123,9 +123,9 @@ def lut_from_photographs(
     source: str,
     turns: AngleRange | None = None,
 ) -> dict[str, Any]:
-    """Measure a panel's grey curve from photographs (names and grey pixels) of its chart, and write the LUT as CSV.
-    `turns` are the panel's angles at black and full white, by default 0 and 90 degrees. Raises InputError, which names
-    the `source`, if a photograph is unusable, or the measured greys do not increase.
+    """Measure a panel's grey curve from photographs (names and grey pixels) of its chart, and write the
+    LUT as CSV. `turns` are the panel's angles at black and full white, by default 0 and 90 degrees. Raises InputError,
+    which names the `source`, if a photograph is unusable, or the measured greys do not increase.
     """
     measured = [histograms(picture, stack, panel, source=f"{source}, {name}") for name, picture in pictures]
     intensity, residual = measure(measured, stack, panel, source=source)
@@ -134,8 +134,8 @@ def lut_from_photographs(
 
 
 def write_lut(out: Path, intensity: F64, turns: AngleRange) -> None:
-    """Write 256 rows of phase and grey (0 to 1), given the intensities (13,) of `GREYS` from 0 (black) to 1 (white).
-    Phases out of the panel's range get its nearest grey.
+    """Write 256 rows of phase and grey (0 to 1), given the intensities (13,) of `GREYS` from 0 (black) to
+    1 (white). Phases out of the panel's range get its nearest grey.
     """
     # The square root of the intensity is smooth at both ends, for bare panels and for monitors with a tone curve.
     root = PchipInterpolator(np.array(GREYS) / 255, np.sqrt(np.maximum.accumulate(intensity)))
@@ -148,8 +148,9 @@ def write_lut(out: Path, intensity: F64, turns: AngleRange) -> None:
 
 
 def histograms(picture: U8, stack: PanelStack, panel: int, *, source: str) -> F64:
-    """Return a histogram of the pixels in the middle of each patch (P, 256) of a grey photograph of a panel's chart.
-    Raises InputError, which names the `source`, if it is too dark or overexposed, or does not show the entire chart.
+    """Return a histogram of the pixels in the middle of each patch (P, 256) of a grey photograph of a
+    panel's chart. Raises InputError, which names the `source`, if it is too dark or overexposed, or does not show the
+    entire chart.
     """
     seen = find_marks(picture, stack, name="")
     mine, marks_seen = seen.panel == panel, seen.marks[panel]
@@ -179,7 +180,8 @@ def histograms(picture: U8, stack: PanelStack, panel: int, *, source: str) -> F6
 
 
 def measure(pictures: list[F64], stack: PanelStack, panel: int, *, source: str) -> tuple[F64, float]:
-    """Estimate the intensities (13,) of `GREYS` from the `histograms` of photographs taken at the same exposure.
+    """Estimate the intensities (13,) of `GREYS` from the `histograms` of photographs taken at the same
+    exposure.
 
     The fit determines the camera's tone curve, the uneven illumination in each photograph (its logarithm is modelled as
     a quadratic polynomial in position) and the intensities. Also return the median of the absolute residuals, each

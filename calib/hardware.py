@@ -31,8 +31,8 @@ CARD_CHARACTERS = 32  # maximum number of characters per line on an identity car
 
 
 class SetupHardware:
-    """Real hardware: monitors on X11, a sensor, a folder of photographs and the keyboard. At most one set of windows
-    and one sensor are open at a time, and `close` releases everything.
+    """Real hardware: monitors on X11, a sensor, a folder of photographs and the keyboard. At most one set
+    of windows and one sensor are open at a time, and `close` releases everything.
     """
 
     simulated = False
@@ -48,7 +48,7 @@ class SetupHardware:
         self._frames: list[SensorFrame] = []  # received, but not yet returned by `sample`
 
     def poll(self) -> Key | None:
-        """Return the next key pressed in the terminal or a panel's window, or None, and keep the windows responsive."""
+        """Return the next key of the terminal or a panel's window, or None; keep the windows responsive."""
         return self._keys() or (self._display.key() if self._display is not None else None)
 
     def key(self) -> Key:
@@ -81,9 +81,9 @@ class SetupHardware:
             self._display.show(alone([*cards[:number], card, *cards[number + 1 :]], number))
 
     def photographs(self, settings: Settings, pictures: U8, *, panel: int | None, say: Say) -> Iterator[Named]:
-        """Show (N, H, W) grey pictures without registration, wait for the user's photographs and return them. `panel`
-        is the one that shows the grey chart, with no grey curve, or None for the boards. Raises InputError if the user
-        stopped or there are no readable photographs, and PanelLost.
+        """Show (N, H, W) grey pictures without registration, wait for the user's photographs and return them.
+        `panel` is the one that shows the grey chart, with no grey curve, or None for the boards. Raises InputError if
+        the user stopped or there are no readable photographs, and PanelLost.
         """
         self.let_go()
         folder = self._photos if panel is None else self._photos / f"grey-{panel}"
@@ -102,8 +102,8 @@ class SetupHardware:
         return photographs(folder)
 
     def open_sensor(self, settings: Settings) -> str:
-        """Start the sensor, wait until it works, and return its name and serial number. Raises InputError if the driver
-        is unknown, it does not work in time, or it delivers eyes in the stack frame.
+        """Start the sensor, wait until it works, and return its name and serial number. Raises InputError if
+        the driver is unknown, it does not work in time, or it delivers eyes in the stack frame.
         """
         self._stop_sensor()
         open_sensor(settings.sensor, self._clock)  # refuses unknown names before anything starts

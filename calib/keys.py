@@ -39,7 +39,7 @@ _OF_BYTES = {data: key for key, (_, pieces) in _MEANINGS.items() for data in pie
 
 
 def parse(data: bytes) -> tuple[list[Key], bytes]:
-    """Decode bytes from a terminal into keys, and the bytes of an escape sequence that is still incomplete."""
+    """Decode bytes from a terminal into keys, and the bytes of an incomplete escape sequence."""
     keys: list[Key] = []
     while data:
         if data[:1] == b"\x1b" and len(data) < 3 and b"\x1b[".startswith(data[:2]):
@@ -52,7 +52,7 @@ def parse(data: bytes) -> tuple[list[Key], bytes]:
 
 
 class TerminalKeys:
-    """Reader for standard input: the first `poll` sets a terminal to character mode, and `close` restores it."""
+    """Reader for standard input: the first `poll` sets character mode, and `close` restores it."""
 
     def __init__(self, descriptor: int | None = None, *, quit_at_end: bool = True) -> None:
         """Choose a file descriptor, by default standard input, whose end is reported as `QUIT` or never."""

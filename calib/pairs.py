@@ -1,4 +1,4 @@
-"""Pairs of a point measured in the sensor frame and the same point's known position in the stack frame."""
+"""Pairs of a point measured in the sensor frame and its known position in the stack frame."""
 
 from __future__ import annotations
 
@@ -82,9 +82,9 @@ class Pairs:
 
 
 def read_pairs(path: Path) -> Pairs:
-    """Read pairs from a CSV file whose header contains `COLUMNS`, or from a JSON list or `{"pairs": [...]}`. Raises
-    InputError, which names rows and columns, if the file cannot be read, has too many pairs or pairs from different
-    sensors, or contains invalid values.
+    """Read pairs from a CSV file whose header contains `COLUMNS`, or from a JSON list or `{"pairs":
+    [...]}`. Raises InputError, which names rows and columns, if the file cannot be read, has too many pairs or pairs
+    from different sensors, or contains invalid values.
     """
     labels, rows = _read_rows(path)
     if len(rows) > MAX_PAIRS:

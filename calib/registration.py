@@ -69,8 +69,8 @@ def homographies(panels: Sequence[PlacedPanel], stack: PanelStack, eye_m: F64) -
 
 
 def geometry_of(panels: Sequence[PlacedPanel], stack: PanelStack, *, eye_m: F64) -> PanelStack:
-    """Return the geometry to configure for panels at their measured poses, registered for the viewing position `eye_m`.
-    Raises Undetermined if the panels are not in the configured order.
+    """Return the geometry to configure for panels at their measured poses, registered for the viewing
+    position `eye_m`. Raises Undetermined if the panels are not in the configured order.
     """
     x_m = tuple(panel.axis_x_m for panel in panels)
     if any(b <= a for a, b in pairwise(x_m)):
@@ -81,9 +81,10 @@ def geometry_of(panels: Sequence[PlacedPanel], stack: PanelStack, *, eye_m: F64)
 
 
 def register_photographs(seen: Sequence[SeenMarks], stack: PanelStack, *, eye_m: F64) -> Registration:
-    """Fit the panels' poses, for the viewing position `eye_m`, to the marks found in photographs, and check the result.
-    Photographs that are faulty, differ in size or contradict the others are excluded. Raises Undetermined, with the
-    reason, if they are too few, too similar or inconsistent, or the result is implausible or too uncertain.
+    """Fit the panels' poses, for the viewing position `eye_m`, to the marks found in photographs, and
+    check the result. Photographs that are faulty, differ in size or contradict the others are excluded. Raises
+    Undetermined, with the reason, if they are too few, too similar or inconsistent, or the result is implausible or too
+    uncertain.
     """
     reference = stack.count // 2
     excluded = {s.name: s.fault for s in seen if s.fault}
@@ -176,9 +177,10 @@ def _refuse_implausible(bundle: Bundle, stack: PanelStack) -> None:
 def register_photos(
     pictures: Iterable[tuple[str, U8]], source: str, out: Path, settings: Settings, *, config: Path | None
 ) -> dict[str, Any]:
-    """Register the panels from photographs (names and grey pixels), and write `out/registration.json` and the `config`.
-    Raises InputError, which names the `source`, if they do not determine the panels' poses, `config` has a different
-    number of panels or cannot be updated, or `out` cannot be written to. `registration.json` is then not written.
+    """Register the panels from photographs (names and grey pixels), and write `out/registration.json` and
+    the `config`. Raises InputError, which names the `source`, if they do not determine the panels' poses, `config` has
+    a different number of panels or cannot be updated, or `out` cannot be written to. `registration.json` is then not
+    written.
     """
     stack = settings.stack.stack()
     if config is not None and len(settings.output.panels) not in (0, stack.count):

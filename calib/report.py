@@ -47,9 +47,9 @@ class Points(NamedTuple):
 
 
 def write_report(file: Path, out: Path, *, viewing: CalibrationSettings) -> dict[str, Any]:
-    """Write a page about a calibration, with its plots as PNG files and its figures in `report.json`, and return these.
-    The error at the eye is averaged over the `viewing` range. Raises InputError for an invalid file, or if it cannot
-    write.
+    """Write a page about a calibration, with its plots as PNG files and its figures in `report.json`, and
+    return these. The error at the eye is averaged over the `viewing` range. Raises InputError for an invalid file, or
+    if it cannot write.
     """
     calibration, table = load_calibration(file), read_table(file)
     points = _stored_points(table.get("data"), calibration, source=file)
@@ -81,7 +81,7 @@ def _stored_points(data: Any, calibration: Calibration, *, source: Path) -> Poin
 
 
 def residual_figure(points: Points, *, limit_m: float) -> bytes:
-    """Plot every point's errors in mm, as in EyeReal's figure S5, with dashed lines at `limit_m`, and return a PNG."""
+    """Plot every point's errors in mm, as EyeReal's figure S5, with lines at `limit_m`; return a PNG."""
     residual_m, used = points.residual_m, points.used
     with drawing(9, 6.5) as canvas:
         axes = canvas.subplots(nrows=3, sharex=True, sharey=True)

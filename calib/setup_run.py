@@ -1,4 +1,4 @@
-"""Guide the user through setting up a display (`phasestack setup`), which can be interrupted and resumed."""
+"""Guide the user through setting up a display, which can be interrupted and resumed."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ def read_progress(path: Path) -> dict[str, Any]:
 def run_setup(
     config: Path, *, out: Path, photos: Path, simulate: bool, seed: int, to_stderr: bool
 ) -> tuple[dict[str, Any], str]:
-    """Create or change a configuration interactively, and return the summary as a dictionary and as text. Reports and
-    the configuration's files go to `out`, the user's photographs to `photos`. Raises InputError if the configuration
-    file or the progress file is invalid.
+    """Create or change a configuration interactively, and return the summary as a dictionary and as text.
+    Reports and the configuration's files go to `out`, the user's photographs to `photos`. Raises InputError if the
+    configuration file or the progress file is invalid.
     """
 
     def say(text: str) -> None:

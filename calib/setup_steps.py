@@ -76,7 +76,7 @@ class SetupStep:
 
 
 def identify(setup: Setup) -> Figures:
-    """Step 1: assign monitors to panels and find each one's mounting, by questions about a card on one at a time."""
+    """Step 1: assign monitors to panels and find each one's mounting, by questions about a card."""
     hardware, count = setup.hardware, setup.settings.stack.stack().count
     monitors = hardware.monitors()
     if len(monitors) < count:
@@ -115,7 +115,7 @@ def _name_of(monitor: Monitor, monitors: Sequence[Monitor]) -> dict[str, Any]:
 
 
 def geometry(setup: Setup) -> Figures:
-    """Step 2: ask for the panels' size, the approximate gap (registration measures it) and the viewing distances."""
+    """Step 2: ask for the panels' size, the approximate gap (measured later) and viewing distances."""
     stack, calibration = setup.settings.stack, setup.settings.calibration
 
     def length_m(question: str, value_m: float, unit_m: float = 1e-3) -> float:
@@ -233,7 +233,7 @@ def calibration(setup: Setup) -> Figures:
 
 
 def service(setup: Setup) -> Figures:
-    """Step 7: collect the service's files and install them, or print the commands without root or in a simulation."""
+    """Step 7: collect the service's files and install them, or print the commands without root."""
     folder = (setup.out / "service").resolve()
     files = gather(setup.config, folder)
     sudo = "" if os.geteuid() == 0 else "sudo "
@@ -255,8 +255,8 @@ def service(setup: Setup) -> Figures:
 
 
 def gather(config: Path, out: Path) -> list[str]:
-    """Copy configuration, calibration and grey curves to a folder, and return their names. Raises InputError. All other
-    files stay where they are, and the copied configuration refers to them by absolute paths.
+    """Copy configuration, calibration and grey curves to a folder, and return their names. Raises
+    InputError. All other files stay where they are, and the copied configuration refers to them by absolute paths.
     """
     if not config.exists():
         raise InputError(config, "", "does not exist yet; run the earlier steps first")

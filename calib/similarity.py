@@ -75,7 +75,7 @@ def _scale(rule: ScaleRule, *, sensor_power: F64, stack_power: F64, correlation:
 
 
 def fit_batch(sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> Similarity:
-    """Fit a similarity to each batch of pairs (..., K, 3) unchecked: degenerate points give infinities or NaN."""
+    """Fit a similarity to each batch of pairs (..., K, 3) unchecked: degenerate points give NaN."""
     sensor, sensor_mean = _centred(sensor_m)
     stack, stack_mean = _centred(stack_m)
     left, values, right = np.linalg.svd(np.swapaxes(sensor, -1, -2) @ stack)

@@ -24,8 +24,8 @@ SAMPLES_HERE = 16  # number of sensor samples per viewpoint, at 30 samples per s
 
 
 class SimulatedHardware(SetupHardware):
-    """Simulated monitors in random order, a depth sensor, and a user at each viewpoint. The sensor has the built-in
-    recording's pose, so the configuration can be tried with `run --replay demo`.
+    """Simulated monitors in random order, a depth sensor, and a user at each viewpoint. The sensor has
+    the built-in recording's pose, so the configuration can be tried with `run --replay demo`.
     """
 
     simulated = True

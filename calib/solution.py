@@ -27,8 +27,8 @@ MIN_SIGMA = 1e-12  # minimum standard deviation of the scale's logarithm, for ex
 
 @dataclass(frozen=True, slots=True)
 class CalibrationSolution:
-    """A calibration computed from K pairs by one method, with its residuals and covariance. The seven parameters and
-    the pivot are defined in `runtime.eyes.calibration`.
+    """A calibration computed from K pairs by one method, with its residuals and covariance. The seven
+    parameters and the pivot are defined in `runtime.eyes.calibration`.
     """
 
     method: Method
@@ -67,8 +67,8 @@ class CalibrationSolution:
         return float(np.sqrt(self.covariance[6, 6]))
 
     def eye_error_m(self, stack_m: F64, *, noise_m: float | None = None) -> F64:
-        """Return the expected RMS error (...) at points (..., 3) in `stack`, in metres. `noise_m` is the pairs'
-        deviation per coordinate, by default that observed.
+        """Return the expected RMS error (...) at points (..., 3) in `stack`, in metres. `noise_m` is the
+        pairs' deviation per coordinate, by default that observed.
         """
         jacobian = position_jacobian(stack_m, pivot_m=self.pivot_m)
         covariance = self.unit_covariance * (self.noise_m if noise_m is None else noise_m) ** 2
@@ -77,8 +77,8 @@ class CalibrationSolution:
 
 
 def design_covariance(stack_m: F64, *, fixed_scale: bool) -> tuple[F64, F64, float]:
-    """Return the pivot (3,), the covariance (7, 7) for noise of 1 m, and the condition number of points (K, 3) in
-    `stack`.
+    """Return the pivot (3,), the covariance (7, 7) for noise of 1 m, and the condition number of points
+    (K, 3) in `stack`.
 
     The covariance is a first-order approximation that assumes equal, independent noise in every coordinate. If the
     noise is given in the sensor frame, multiply it by the scale first. If the points leave a parameter undetermined,
@@ -104,8 +104,8 @@ def design_covariance(stack_m: F64, *, fixed_scale: bool) -> tuple[F64, F64, flo
 def solve(
     sensor_m: F64, stack_m: F64, *, method: Method, known_scale: float = 1.0, reason: str = ""
 ) -> CalibrationSolution:
-    """Compute a calibration from points (K, 3), measured in `sensor` and known in `stack`, with all its error
-    estimates. `known_scale` is for `fixed-scale`; the `reason` for the method is stored. Raises Degenerate as
+    """Compute a calibration from points (K, 3), measured in `sensor` and known in `stack`, with all its
+    error estimates. `known_scale` is for `fixed-scale`; the `reason` for the method is stored. Raises Degenerate as
     `similarity.fit`.
     """
     used = np.ones(len(sensor_m), bool)
@@ -131,7 +131,8 @@ def solve(
 
 
 def posterior_scale(fitted: float, *, sigma: float, freedom: int) -> tuple[float, float]:
-    """Return the mean and standard deviation of the log scale's posterior, averaged over the kinds of sensors.
+    """Return the mean and standard deviation of the log scale's posterior, averaged over the kinds of
+    sensors.
 
     This avoids a threshold between the kinds, and leaves the fitted scale nearly unchanged for a sensor whose scale is
     off by a tenth. `sigma`, of the logarithm `fitted`, was estimated from residuals with `freedom` degrees, which make

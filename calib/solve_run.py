@@ -29,9 +29,9 @@ STORED_PAIRS = 500  # the calibration file contains the pairs if there are at mo
 def solve_file(
     pairs_path: Path, out: Path, *, settings: Settings, method: str = "", known_scale: float = 1.0
 ) -> dict[str, Any]:
-    """Compute a calibration from a file of pairs and write it; the version it replaces is kept. Without a method, it is
-    the one with the least expected error at the eye. `known_scale` is for `fixed-scale`. Raises InputError if the pairs
-    cannot be read or do not determine the calibration, or the method is unknown.
+    """Compute a calibration from a file of pairs and write it; the version it replaces is kept. Without a
+    method, it is the one with the least expected error at the eye. `known_scale` is for `fixed-scale`. Raises
+    InputError if the pairs cannot be read or do not determine the calibration, or the method is unknown.
     """
     if method and method not in METHODS:
         raise InputError("calibrate solve", "--method", f"must be one of {', '.join(METHODS)}, not {method}")
@@ -82,8 +82,8 @@ def _figures(solution: CalibrationSolution, volume_m: F64) -> dict[str, Any]:
 def calibration_text(
     solution: CalibrationSolution, pairs: Pairs, settings: Settings, *, warnings: list[str], volume_m: F64
 ) -> str:
-    """Format a solution, and its pairs as `[data]`, as a TOML file for `runtime.eyes.calibration`. The error at the eye
-    is averaged over `volume_m`, points (..., 3) in `stack`.
+    """Format a solution, and its pairs as `[data]`, as a TOML file for `runtime.eyes.calibration`. The
+    error at the eye is averaged over `volume_m`, points (..., 3) in `stack`.
     """
     document = tomlkit.document()
     document.add(tomlkit.comment("Written by `phasestack calibrate solve`. Lengths are in metres, angles in radians."))

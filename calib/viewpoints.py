@@ -33,7 +33,7 @@ class Viewpoint:
         return spherical_m(self.radius_cm / 100, phi_deg=self.phi_deg, theta_deg=self.theta_deg)
 
     def eyes_m(self, ipd_m: float = IPD_M) -> F64:
-        """Return the (2, 3) eyes in `stack`, on a horizontal line perpendicular to the line of sight to the centre."""
+        """Eyes (2, 3) in `stack`, on a horizontal line perpendicular to the line of sight to the centre."""
         right = stack_from_eye(self.midpoint_m)[:3, 0]
         return self.midpoint_m + np.outer([-ipd_m / 2, ipd_m / 2], right)
 
@@ -60,9 +60,9 @@ def grid(viewing: CalibrationSettings = USUAL) -> tuple[Viewpoint, ...]:
 
 
 def viewing_volume_m(viewing: CalibrationSettings = USUAL) -> F64:
-    """Return points (125, 3) in the `stack` frame that span the viewers' range of movement. It reaches from 0.75 times
-    the nearest to 1.5 times the farthest viewpoint's distance, and 15 degrees farther to each side and 10 up and down:
-    by default from 0.3 to 0.9 m and 25 degrees to each side.
+    """Return points (125, 3) in the `stack` frame that span the viewers' range of movement. It reaches
+    from 0.75 times the nearest to 1.5 times the farthest viewpoint's distance, and 15 degrees farther to each side and
+    10 up and down: by default from 0.3 to 0.9 m and 25 degrees to each side.
     """
     (near_m, far_m), (low_deg, high_deg) = viewing.viewing_m, viewing.viewing_up_deg
     side_deg = viewing.viewing_side_deg + 15

@@ -20,9 +20,9 @@ WIDTH_KEY = "subnets.in_conv.0.weight"
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
-    """Read a checkpoint: a dictionary whose `model` entry is a state dictionary of tensors. Only plain values, tensors
-    and an `argparse.Namespace` of plain values (which the published code saves) are deserialised. Raises InputError if
-    the file cannot be read, contains other objects, or has no `model` entry.
+    """Read a checkpoint: a dictionary whose `model` entry is a state dictionary of tensors. Only plain
+    values, tensors and an `argparse.Namespace` of plain values (which the published code saves) are deserialised.
+    Raises InputError if the file cannot be read, contains other objects, or has no `model` entry.
     """
     data = untrusted_input.read_bytes(path, most_bytes=FILE_BYTES_MAX)
     try:
@@ -37,7 +37,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def eyereal_width(state: Mapping[str, Tensor], *, source: Path) -> int:
-    """Return the channels of a published network's first layer, by its weights. Raises InputError for other weights."""
+    """Channels of a published network's first layer, by its weights. Raises InputError for other weights."""
     first = state.get(WIDTH_KEY)
     if first is None or first.ndim != 4:
         raise InputError(source, WIDTH_KEY, "is missing, so this is not a checkpoint of the published network")
@@ -45,7 +45,7 @@ def eyereal_width(state: Mapping[str, Tensor], *, source: Path) -> int:
 
 
 def fill(net: nn.Module, state: Mapping[str, Tensor], *, source: str | Path, arch: str) -> None:
-    """Load weights by name into a network. Raises InputError, which names the weight, if one is missing or wrong."""
+    """Load weights by name into a network. Raises InputError, which names the weight at fault."""
     expected = net.state_dict()
     missing = [key for key in expected if key not in state]
     # Old checkpoints lack this counter, which is not used for inference.

@@ -38,8 +38,8 @@ def random_stack(random: Random, *, width_px: int, height_px: int) -> PanelStack
 
 
 def random_eyes(random: Random, stack: PanelStack) -> F64:
-    """Return random (2, 3) eyes in `stack`, of a head that may be rolled and turned. It is 0.1 to 4 m from the origin
-    and at least 0.1 m in front of the panels.
+    """Return random (2, 3) eyes in `stack`, of a head that may be rolled and turned. It is 0.1 to 4 m
+    from the origin and at least 0.1 m in front of the panels.
     """
     front_m = stack.x_m[-1]
     distance_m = math.exp(random.uniform(math.log(0.1 + front_m), math.log(4.0)))
@@ -73,7 +73,7 @@ def is_served(eyes_m: Eyes, stack: PanelStack) -> bool:
 def random_place(
     random: Random, *, width_px: int, height_px: int, stack: PanelStack | None = None
 ) -> tuple[PanelStack, F64]:
-    """Return `stack`, or random panels of this size in pixels, and random (2, 3) eyes that see enough of them."""
+    """Return `stack`, or random panels of this size in pixels, and random (2, 3) eyes served by them."""
     while True:
         panels = stack or random_stack(random, width_px=width_px, height_px=height_px)
         eyes = random_eyes(random, panels)
@@ -84,8 +84,8 @@ def random_place(
 def random_pair(
     random: Random, *, width_px: int, height_px: int, stack: PanelStack | None = None, fov_deg: float = 0.0
 ) -> TrainingPair:
-    """Draw a random scene as seen from random eyes, on `stack` or on random panels of the pictures' size. With
-    `fov_deg` 0, the pictures are as wide as the panels.
+    """Draw a random scene as seen from random eyes, on `stack` or on random panels of the pictures' size.
+    With `fov_deg` 0, the pictures are as wide as the panels.
     """
     stack, eyes = random_place(random, width_px=width_px, height_px=height_px, stack=stack)
     scene = random_scene(random, stack, eyes.mean(axis=0))

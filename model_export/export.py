@@ -112,9 +112,9 @@ def spectral_model(name: str) -> tuple[bytes, nn.Module]:
 def picture_network(
     arch: str, checkpoint: Path | None, random_init: int | None, options: dict[str, Any]
 ) -> tuple[Network, str]:
-    """Create a picture network (name or `module:Class`) and a SHA-256 that identifies its weights. These are a
-    checkpoint's, or random. `options` for the class override those in a checkpoint from `phasestack train`. Raises
-    InputError if there are no weights, or the checkpoint does not belong to this network.
+    """Create a picture network (name or `module:Class`) and a SHA-256 that identifies its weights. These
+    are a checkpoint's, or random. `options` for the class override those in a checkpoint from `phasestack train`.
+    Raises InputError if there are no weights, or the checkpoint does not belong to this network.
     """
     if checkpoint is None:
         if random_init is None:
@@ -140,8 +140,8 @@ def picture_network(
 def picture_file(
     network: Network, origin: str, *, width_px: int, height_px: int, eye_order: EyeOrder = "left-right"
 ) -> bytes:
-    """Export a picture network, whose contract gets `origin` and the order of eyes, to ONNX for pictures of one size.
-    Raises InputError if it fails for pictures of this size, or torch cannot export it.
+    """Export a picture network, whose contract gets `origin` and the order of eyes, to ONNX for pictures
+    of one size. Raises InputError if it fails for pictures of this size, or torch cannot export it.
     """
     form, net, size = network.form, network.net.eval(), {"width_px": width_px, "height_px": height_px}
     probe(network, **size)

@@ -30,8 +30,8 @@ def _block(channels: int, middle: int, out: int) -> nn.Sequential:
 
 
 class Up(nn.Module):
-    """A decoder stage: double the input (bilinear, aligned corners), pad it to the skip connection's size, join,
-    convolve.
+    """A decoder stage: double the input (bilinear, aligned corners), pad it to the skip connection's
+    size, join, convolve.
     """
 
     def __init__(self, channels: int, out: int) -> None:
@@ -48,7 +48,7 @@ class Up(nn.Module):
 
 
 class UNet(nn.Module):
-    """U-Net with five levels; the published network's `subnets` module (17,303,721 parameters at width 32)."""
+    """U-Net with five levels; the published network's `subnets` module (17.3 million parameters)."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -76,9 +76,9 @@ class UNet(nn.Module):
 
 
 class EyeRealNet(nn.Module):
-    """The published network, which maps the eyes' pictures, resampled for every panel, to panel values. The input
-    channels are intensities in [0, 1], ordered by panel, then eye, then RGB. The output channels are ordered by panel,
-    then RGB. The outputs are in [-0.2, 0.8], as in the published code, and the panel clips negative values.
+    """The published network, which maps the eyes' pictures, resampled for every panel, to panel values.
+    The input channels are intensities in [0, 1], ordered by panel, then eye, then RGB. The output channels are ordered
+    by panel, then RGB. The outputs are in [-0.2, 0.8], as in the published code, and the panel clips negative values.
     """
 
     input_frame, input_value, output = "panel", "intensity", "panels"

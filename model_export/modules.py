@@ -63,7 +63,7 @@ class Network:
     options: dict[str, Any]  # arguments used to create `net`
 
     def steps(self) -> tuple[Sequence[Any], Sequence[Any]]:
-        """Return the sizes and momenta of the steps that follow: tensors `step_sizes`, `step_momenta`, or constants."""
+        """Sizes and momenta of the steps that follow: tensors `step_sizes`, `step_momenta`, or constants."""
         learned = [getattr(self.net, name, None) for name in ("step_sizes", "step_momenta")]
         if isinstance(learned[0], Tensor) and isinstance(learned[1], Tensor):
             return list(learned[0].clamp(1e-3, 3)), list(learned[1].clamp(0, 0.99))
@@ -72,7 +72,7 @@ class Network:
 
 @contextmanager
 def blamed(arch: str, field: str) -> Iterator[None]:
-    """Convert any exception of a user's module to an InputError that names the module and the operation `field`."""
+    """Convert any exception of a user's module to an InputError that names the module and `field`."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -91,9 +91,9 @@ def check_known(arch: str, *others: str) -> None:
 
 
 def make_network(arch: str, options: dict[str, Any], *, seed: int = 0) -> Network:
-    """Create a picture network, by name or `module:Class`, with random weights. `options` are the class's arguments,
-    and `steps`, the number of solver steps that follow. Raises InputError if the network is unknown, the class cannot
-    be loaded or created, or an attribute or option is invalid.
+    """Create a picture network, by name or `module:Class`, with random weights. `options` are the class's
+    arguments, and `steps`, the number of solver steps that follow. Raises InputError if the network is unknown, the
+    class cannot be loaded or created, or an attribute or option is invalid.
     """
     check_known(arch)
     kind = plugin_class(KNOWN.get(arch, arch), nn.Module, field="--arch")

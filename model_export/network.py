@@ -53,8 +53,8 @@ class SpectralSolver(nn.Module):
         self.log_sigma_scale = nn.Parameter(torch.zeros(2))  # factors for eye_sigma_px along and across the eyes' line
 
     def gains(self, spectrum: Tensor, cell_frequencies: Tensor, eye_sigma_px: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the numerator and denominator of g's gain without the part explained by h, and h's gain. All have
-        shape (patterns, cells + 1): a pattern is a wave along a block's rows times one along a cell's columns.
+        """Return the numerator and denominator of g's gain without the part explained by h, and h's gain. All
+        have shape (patterns, cells + 1): a pattern is a wave along a block's rows times one along a cell's columns.
         `spectrum` are the chain's singular values; the others are inputs of `forward`.
         """
         scale = torch.exp(self.log_sigma_scale)

@@ -121,7 +121,7 @@ def prototype(*, width_px: int, height_px: int) -> PanelStack:
 
 
 def photographed(pair: Pair, stack: PanelStack, fov_deg: float) -> TrainingPair:
-    """Resample a published pair as if the eyes looked at the display's centre, at the panels' size in pixels."""
+    """Resample a published pair as if the eyes looked at the display's centre, at the panels' size."""
     size, images = {"width_px": stack.width_px, "height_px": stack.height_px}, []
     for side, eye_m in enumerate(pair.eyes_m):
         size_px = stack.width_px, stack.height_px

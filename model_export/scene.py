@@ -30,8 +30,8 @@ Scene = tuple[Parallelogram, ...]
 
 
 def draw(scene: Scene, projection: F64, *, width_px: int, height_px: int) -> U8:
-    """Draw a picture (h, w, 3) of planes by a 3x4 projection from `stack`, the nearest at each pixel. Translucent edges
-    are blended with the planes drawn earlier. Nothing behind the eye is drawn.
+    """Draw a picture (h, w, 3) of planes by a 3x4 projection from `stack`, the nearest at each pixel.
+    Translucent edges are blended with the planes drawn earlier. Nothing behind the eye is drawn.
     """
     width, height = width_px * FINER, height_px * FINER
     picture = np.zeros((height, width, 3), np.float32)
@@ -99,8 +99,8 @@ def random_scene(random: Random, stack: PanelStack, middle_m: F64) -> Scene:
     tones = np.clip(np.rint((np.arange(256) - 127.5) * contrast + 127.5 + 255 * level), 0, 255).astype(np.uint8)
 
     def card(x_m: float, size_m: F64, aside: F64, *, slant: float, see_through: bool) -> Parallelogram:
-        """Return a card with a random texture, rotated by at most `slant` rad, opaque only on lines if `see_through`.
-        `aside` (2,) is where the viewer sees it on the middle panel, relative to the panel's size.
+        """Return a card with a random texture, rotated by at most `slant` rad, opaque only on lines if
+        `see_through`. `aside` (2,) is where the viewer sees it on the middle panel, relative to the panel's size.
         """
         share = (x_m - centre_m) / distance_m
         middle = aside * panel_m * (1 - share) + middle_m[1:] * share

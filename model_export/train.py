@@ -63,9 +63,9 @@ class Training(Section):
 
 
 def run_training(out: Path, training: Training, *, device: Device = "auto", resume: bool = False) -> dict[str, Any]:
-    """Train a picture network, and write `checkpoint.pth`, `curve.csv` and `curve.png` to a folder at intervals.
-    `resume` continues from its checkpoint. Raises InputError if the network, the data or the checkpoint is invalid, or
-    the loss is not finite.
+    """Train a picture network, and write `checkpoint.pth`, `curve.csv` and `curve.png` to a folder at
+    intervals. `resume` continues from its checkpoint. Raises InputError if the network, the data or the checkpoint is
+    invalid, or the loss is not finite.
     """
     place, start = _placed(device), time.monotonic()
     network = make_network(training.arch, training.options, seed=training.seed)

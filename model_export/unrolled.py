@@ -13,7 +13,7 @@ from runtime.config import Section
 
 
 class Unrolled(nn.Module):
-    """Network whose only weights are the sizes and momenta of its steps, from panels that share the mean picture."""
+    """Network whose only weights are the sizes and momenta of its steps, from panels that are equal."""
 
     class Options(Section):
         """The number of steps and their initial size."""
@@ -27,8 +27,8 @@ class Unrolled(nn.Module):
         self.step_momenta = nn.Parameter(torch.full((steps,), MOMENTUM))
 
     def forward(self, eyes: Tensor) -> Tensor:
-        """Map intensities (n, 6, h, w) to equal panel values (n, 9, h, w): a third of the phase sum, 1 to 2, of the
-        mean.
+        """Map intensities (n, 6, h, w) to equal panel values (n, 9, h, w): a third of the phase sum, 1 to 2,
+        of the mean.
         """
         mean = (eyes[:, :3] + eyes[:, 3:]) / 2
         phase = torch.asin(mean.clamp(0, 1).sqrt()) * (2 / torch.pi)

@@ -79,8 +79,8 @@ def validate_file(path: Path) -> Report:
 
 
 def check_model(data: bytes, *, source: str, reference: Reference | None = None) -> Report:
-    """Check a model's results against a reference, such as the torch module, by default the unoptimised graph. Raises
-    InputError if the bytes are not an ONNX model, or the model has no valid contract.
+    """Check a model's results against a reference, such as the torch module, by default the unoptimised
+    graph. Raises InputError if the bytes are not an ONNX model, or the model has no valid contract.
     """
     try:
         model = onnx.load_from_string(data)

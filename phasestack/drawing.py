@@ -72,8 +72,8 @@ def request_of(message: Mapping[str, Any]) -> DrawingRequest:
 
 
 def found_address() -> str:
-    """Return the address for drawing programs of a running service, `run` or `try`, after selecting scene `program`
-    there. Raises TransientError if nothing is running, or the scene does not start.
+    """Return the address for drawing programs of a running service, `run` or `try`, after selecting scene
+    `program` there. Raises TransientError if nothing is running, or the scene does not start.
     """
     tried = sorted(Path(tempfile.gettempdir()).glob("phasestack-*/status.sock"), key=_changed_s, reverse=True)
     own = [path for path in tried if path.exists() and path.stat().st_uid == os.getuid()]
@@ -100,7 +100,7 @@ def _changed_s(path: Path) -> float:
 
 
 class DrawingClient:
-    """Connection of an application that draws, restored by itself. Neither method waits; both work on any thread."""
+    """Connection of an application that draws, restored by itself. No method waits."""
 
     def __init__(self, address: str, *, name: str) -> None:
         """Start connecting to an address, or "" to look for it; the log has `name`. Raises InputError without
@@ -126,7 +126,7 @@ class DrawingClient:
         return request
 
     def answer(self, request: DrawingRequest, eye: EyeRequest, pixels: U8, depth: F32) -> None:
-        """Send an eye's RGBA picture and depth buffer (0-1, 1: background), bottom row first, unless disconnected."""
+        """Send an eye's RGBA picture and depth buffer (0-1, 1: background), bottom row first."""
         head, parts = HEAD.pack(request.number, eye.side), (pixels, depth.astype("<f4", copy=False))
         memory, socket = self._memory, self._socket
         if socket is None:

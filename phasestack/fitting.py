@@ -47,9 +47,9 @@ def axes_of(camera: AppCamera) -> F64:
 
 
 def comfortable_m(eyes_m: Eyes, comfort_deg: float) -> tuple[float, float]:
-    """Return how far content may be in front of and behind the display, in metres, for (n, 3) eyes. A point nearer or
-    farther than the display differs from it by the vergence angle ipd · (1/distance - 1/viewer), which is at most
-    `comfort_deg`.
+    """Return how far content may be in front of and behind the display, in metres, for (n, 3) eyes. A
+    point nearer or farther than the display differs from it by the vergence angle ipd · (1/distance - 1/viewer), which
+    is at most `comfort_deg`.
     """
     viewer_m = float(eyes_m[:, 0].mean())
     ipd_m = float(np.linalg.norm(eyes_m[0] - eyes_m[-1])) if len(eyes_m) > 1 else IPD_M
@@ -62,9 +62,9 @@ def comfortable_m(eyes_m: Eyes, comfort_deg: float) -> tuple[float, float]:
 def stack_from_scene(
     camera: AppCamera, bounds: F64 | None, eyes_m: Eyes, display_m: tuple[float, float], comfort_deg: float
 ) -> F64:
-    """Return the affine map (4, 4) from the application's scene, between corners `bounds` (2, 3), to frame `stack`. The
-    focal point is at the display's centre, and what is in view there fills the display (width, height). A scene that
-    would be deeper than `comfort_deg` of vergence for (n, 3) eyes is flattened.
+    """Return the affine map (4, 4) from the application's scene, between corners `bounds` (2, 3), to
+    frame `stack`. The focal point is at the display's centre, and what is in view there fills the display (width,
+    height). A scene that would be deeper than `comfort_deg` of vergence for (n, 3) eyes is flattened.
     """
     axes, scale = axes_of(camera), display_m[1] / camera.height
     if camera.aspect * camera.height * scale > display_m[0]:
@@ -84,9 +84,9 @@ def stack_from_scene(
 
 
 def eye_camera(eye: EyeRequest, placed: F64) -> EyeCamera:
-    """Return the camera that draws an eye's picture, for a map from `stack_from_scene`. It is where the eye is in the
-    scene and looks as the application's camera does, which keeps lights and volumes right also if the scene is
-    flattened. Everything else is in its projection.
+    """Return the camera that draws an eye's picture, for a map from `stack_from_scene`. It is where the
+    eye is in the scene and looks as the application's camera does, which keeps lights and volumes right also if the
+    scene is flattened. Everything else is in its projection.
     """
     inverse = np.linalg.inv(placed)
     position = (inverse @ [*eye.eye_m, 1.0])[:3]

@@ -85,8 +85,8 @@ class Solving(TypedDict, total=False):
 
 
 class Result:
-    """The layers computed for pictures, one for each eye. The result can also show what each eye sees of the layers,
-    measure the quality, and save everything to files.
+    """The layers computed for pictures, one for each eye. The result can also show what each eye sees of
+    the layers, measure the quality, and save everything to files.
     """
 
     layers: U8  # (panels, h, w, 3), rear to front
@@ -104,15 +104,15 @@ class Result:
 
     @property
     def quality(self) -> PairQuality:
-        """Quality of what the eyes see, measured on first access, which may take longer than solving. A warning is
-        issued for each known reason of ghosts.
+        """Quality of what the eyes see, measured on first access, which may take longer than solving. A
+        warning is issued for each known reason of ghosts.
         """
         self._warn()
         return self._pair.quality
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
-        """Warnings that the eyes will see ghosts, such as from too much disparity of two pictures for the stack."""
+        """Warnings that the eyes will see ghosts, such as from too much disparity for the stack."""
         if self._doubts:
             return self._doubts
         every = max(1, min(NOTED_EVERY, min(self._asked.pictures[0].shape[:2]) // EVERY_LEAST))
@@ -156,8 +156,8 @@ class Result:
         return line + f"PSNR with one ray per pixel, as published: {self._pair.quality.psnr_db:.1f} dB"
 
     def show(self) -> Path:
-        """Open a browser page of the layers and the eyes' views, and return its temporary HTML file, which is not
-        deleted.
+        """Open a browser page of the layers and the eyes' views, and return its temporary HTML file, which is
+        not deleted.
         """
         path = Path(tempfile.mkdtemp(prefix="phasestack-")) / "viewer.html"
         path.write_text(self._pair.viewer([self._line, *self.notes]), encoding="utf-8")
@@ -416,8 +416,8 @@ def camera(eye_m: Sequence[float] | F64, *, width_px: int, height_px: int, fov_d
 def project(
     points_m: ArrayLike, *, eye_m: Sequence[float] | F64, width_px: int, height_px: int, fov_deg: float = 40.0
 ) -> F64:
-    """Project points (..., 3) in `stack` to pixels (..., 2) of an eye's picture, NaN behind the eye. `fov_deg` is
-    horizontal. Raises ValueError, which begins with an argument's name.
+    """Project points (..., 3) in `stack` to pixels (..., 2) of an eye's picture, NaN behind the eye.
+    `fov_deg` is horizontal. Raises ValueError, which begins with an argument's name.
     """
     points = as_numbers("points_m", points_m, "must be numbers in metres")
     if points.ndim < 1 or points.shape[-1] != 3:

@@ -21,8 +21,8 @@ OVERSHOOT = 0.3  # how far resampled values may lie outside the range, as a frac
 
 
 def as_picture(name: str, given: Any) -> Picture:
-    """Convert an array, a tensor, or a Pillow image to (h, w, 3) uint8, or float32 in [0, 1], over white. Raises
-    ValueError, which suggests a conversion, if the shape, dtype or values of `name` do not fit.
+    """Convert an array, a tensor, or a Pillow image to (h, w, 3) uint8, or float32 in [0, 1], over white.
+    Raises ValueError, which suggests a conversion, if the shape, dtype or values of `name` do not fit.
     """
     picture: Any = _from_pillow(name, given) if hasattr(given, "getbands") else as_array(name, given)
     if picture.ndim != 3 or picture.shape[2] not in (3, 4) or min(picture.shape[:2]) < LEAST_PX:
@@ -70,7 +70,7 @@ def as_array(name: str, given: Any) -> Any:
 
 
 def as_numbers(name: str, given: Any, told: str) -> F64:
-    """Convert numbers, or tensors on any device, to float64. Raises ValueError, `name` and `told`, for others."""
+    """Convert numbers, or tensors on any device, to float64. Raises ValueError, `name` and `told`."""
     try:
         return np.asarray(_detached(given), np.float64)
     except (TypeError, ValueError, RuntimeError):
@@ -137,8 +137,8 @@ def as_codes(picture: Picture) -> U8:
 
 
 def find_eyes(picture: ArrayLike) -> Pupils | None:
-    """Find the nearest viewer's pupils in a picture (h, w, 3 or 4), uint8 or floats in 0..1, or a Pillow image, or
-    None. `eyes_px` (2, 2) has pixel centres at half-integers and the viewer's left eye first, which is on the right
-    unless mirrored; `sigma_px` is each coordinate's standard deviation. Raises ValueError if there is no picture.
+    """Find the nearest viewer's pupils in a picture (h, w, 3 or 4), uint8 or floats in 0..1, or a Pillow
+    image, or None. `eyes_px` (2, 2) has pixel centres at half-integers and the viewer's left eye first, which is on the
+    right unless mirrored; `sigma_px` is each coordinate's standard deviation. Raises ValueError if there is no picture.
     """
     return pupils.find_eyes(as_codes(as_picture("picture", picture)))

@@ -126,8 +126,8 @@ class BlackBoxMessage(NamedTuple):
 
 
 class Recorder(logging.Handler):
-    """Records a run's samples, refreshes, states and log, from `watches` to `close`. The observer methods are called on
-    the presenter's thread. Any thread may log. Each file is written by a background job.
+    """Records a run's samples, refreshes, states and log, from `watches` to `close`. The observer methods
+    are called on the presenter's thread. Any thread may log. Each file is written by a background job.
     """
 
     def __init__(self, folder: Path, *, minutes: float) -> None:
@@ -225,8 +225,8 @@ class Recorder(logging.Handler):
             self._fresh = min(self._fresh, len(self._kept))  # limits the memory used if the journal hangs
 
     def save(self, kind: str, saved: Saved = lambda problem, path: None) -> None:
-        """Write all messages to a file named by `kind` in the background, then call `saved` with a problem or "", and
-        the file. Requests of the same kind that arrive before their file has been started share it.
+        """Write all messages to a file named by `kind` in the background, then call `saved` with a problem or
+        "", and the file. Requests of the same kind that arrive before their file has been started share it.
         """
         if not self._most_ns or self._presenter is None:
             saved("the black box is switched off; set service.blackbox_minutes above 0", None)
@@ -315,9 +315,9 @@ def _head(presenter: Presenter) -> tuple[RecordingHeader, str]:
 
 
 def write_file(folder: Path, kind: str, kept: list[BlackBoxMessage], header: RecordingHeader, settings: str) -> Path:
-    """Write messages to a new file, atomically, and return its path. Raises OSError if that fails. The file can be read
-    only by its owner, because it shows how viewers moved. The number in its name is higher than any other in the
-    folder, because dates may be wrong if the wall clock has been set back.
+    """Write messages to a new file, atomically, and return its path. Raises OSError if that fails. The
+    file can be read only by its owner, because it shows how viewers moved. The number in its name is higher than any
+    other in the folder, because dates may be wrong if the wall clock has been set back.
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = _next_name(folder, kind, datetime.now(UTC))
@@ -426,8 +426,8 @@ def _find_cut(folder: Path) -> None:
 
 
 def make_room(folder: Path) -> None:
-    """Delete files of the most common kind until at most `FILES_MAX` are left in the folder. The newest file in the
-    folder is kept. The first file of any kind is deleted only after all others of that kind.
+    """Delete files of the most common kind until at most `FILES_MAX` are left in the folder. The newest
+    file in the folder is kept. The first file of any kind is deleted only after all others of that kind.
     """
     kinds: dict[str, list[Path]] = {}
     *earlier, _ = sorted(folder.glob(f"{PREFIX}*.mcap"), key=lambda path: (_number(path), path.name)) or [folder]

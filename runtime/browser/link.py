@@ -30,8 +30,9 @@ class SeenEyes:
 
 @dataclass(eq=False)
 class BrowserLink:
-    """Passes data between the refresh loop and all pages that show the display. Thread-safe. The page that has been
-    connected longest is the viewer: only its samples or camera pictures are used, and all other pages just watch.
+    """Passes data between the refresh loop and all pages that show the display. Thread-safe. The page
+    that has been connected longest is the viewer: only its samples or camera pictures are used, and all other pages
+    just watch.
     """
 
     stack: PanelStack  # the stack being shown

@@ -51,7 +51,8 @@ def viewer_html(
     relief: F32 | None = None,
     follows: bool = True,
 ) -> str:
-    """Return the HTML of a viewer page for one solution, with each eye's target picture, if any, and its relief (h, w).
+    """Return the HTML of a viewer page for one solution, with each eye's target picture, if any, and its
+    relief (h, w).
 
     The layers are stored losslessly if they fit into `LAYERS_BYTES`. If not, they are stored as AVIF, and the page
     states their PSNR. `text` is the page's title, then lines below the controls. If `follows`, the outer panels are

@@ -19,8 +19,8 @@ def load_settings(path: Path | None) -> Settings:
 
 
 def load_stack(path: Path, *, width_px: int, height_px: int) -> PanelStack:
-    """Read the stack's geometry from a file given with `--panels`, with these numbers of pixels if it gives none.
-    Raises InputError if the file cannot be read, a field is missing or a value is invalid.
+    """Read the stack's geometry from a file given with `--panels`, with these numbers of pixels if it
+    gives none. Raises InputError if the file cannot be read, a field is missing or a value is invalid.
     """
     table = {"width_px": width_px, "height_px": height_px} | read_table(path)
     for name in ("width_m", "height_m", "x_m"):
@@ -43,8 +43,8 @@ def with_options(
     model: str | None = None,
     backend: str | None = None,
 ) -> Settings:
-    """Return the settings with command-line options other than None and False applied; `loop` repeats the recording.
-    Raises InputError, which names the option, if a value is invalid.
+    """Return the settings with command-line options other than None and False applied; `loop` repeats the
+    recording. Raises InputError, which names the option, if a value is invalid.
     """
     overrides: tuple[tuple[str, str, dict[str, Any] | None], ...] = (
         ("--replay", "sensor", None if replay is None else {"driver": "replay", "source": replay}),

@@ -14,8 +14,8 @@ from runtime.support.plugins import located
 
 
 def path_in(folder: Path | None, value: str, *, or_name: bool = False) -> str:
-    """Return a path resolved against the configuration file's folder, if any; with `or_name`, a word without suffix
-    stays.
+    """Return a path resolved against the configuration file's folder, if any; with `or_name`, a word
+    without suffix stays.
     """
     if folder is None or Path(value).name in ("", ".."):
         return value

@@ -51,7 +51,7 @@ class ContentInfo:
 
 
 class ContentSource(ABC):
-    """Scene that can be drawn for any eye position. Create, use and close it on the thread that owns its GL context."""
+    """Scene that can be drawn for any eye position, on the one thread that owns its GL context."""
 
     Options: ClassVar[type[BaseModel]] = Section  # model that validates [content.options] for a user-defined scene
     info: ContentInfo
@@ -65,7 +65,8 @@ class ContentSource(ABC):
 
     @abstractmethod
     def render(self, view: View, *, time_ns: int) -> U8:
-        """Return the eye's picture on the view's raster as an RGBA array (height_px, width_px, 4), row 0 at the top.
+        """Return the eye's picture on the view's raster as an RGBA array (height_px, width_px, 4), row 0 at
+        the top.
 
         Colours are already blended with the background. Alpha is the content's coverage and is 0 only where nothing but
         the background is visible. The array is valid until the next call for the same side. `time_ns` is on the run's
@@ -74,8 +75,8 @@ class ContentSource(ABC):
         """
 
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture | None:
-        """Return the picture as a texture, valid until the next for the same side, or None if the caller must use
-        `render`. Raises ContentFailure if the picture cannot be drawn at the moment.
+        """Return the picture as a texture, valid until the next for the same side, or None if the caller must
+        use `render`. Raises ContentFailure if the picture cannot be drawn at the moment.
         """
         return None
 
@@ -91,14 +92,14 @@ class ContentSource(ABC):
         return None
 
     def expect(self, views: Sequence[View], *, time_ns: int) -> None:  # noqa: B027 - most have nothing to prepare
-        """Prepare for the views that will be drawn next, usually one for each eye. Raises ContentFailure if that fails
-        for now.
+        """Prepare for the views that will be drawn next, usually one for each eye. Raises ContentFailure if
+        that fails for now.
         """
 
     @property
     def program(self) -> dict[str, Any] | None:
-        """Return the `address` that a drawing program connects to and its recent `frame_ms`, or None if there is no
-        program.
+        """Return the `address` that a drawing program connects to and its recent `frame_ms`, or None if there
+        is no program.
         """
         return None
 
@@ -120,8 +121,8 @@ class ContentSource(ABC):
 
     @property
     def problem(self) -> str:
-        """Describe the current fault in one line, or return an empty string. The last good picture stays on the
-        display.
+        """Describe the current fault in one line, or return an empty string. The last good picture stays on
+        the display.
         """
         return ""
 

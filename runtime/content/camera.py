@@ -13,9 +13,9 @@ NEAREST_M = 1e-3  # distance from the eye to the near plane
 
 
 def clip_from_stack(view: View, *, near_m: float, far_m: float) -> F64:
-    """Return the 4x4 OpenGL clip matrix for a view. Raises ValueError if nothing is in front of the eye. The raster's v
-    axis is mapped to OpenGL's +y, whose rows are stored bottom first, so pictures that are read back need not be
-    flipped.
+    """Return the 4x4 OpenGL clip matrix for a view. Raises ValueError if nothing is in front of the eye.
+    The raster's v axis is mapped to OpenGL's +y, whose rows are stored bottom first, so pictures that are read back
+    need not be flipped.
     """
     if not 0.0 < near_m < far_m:
         raise ValueError(
@@ -34,7 +34,7 @@ def box_corners(low_m: ArrayLike, high_m: ArrayLike) -> F64:
 
 
 def project(pixels_from_stack: F64, points_m: F64) -> tuple[F64, F64]:
-    """Project points (n, 3) in `stack` to pixels (n, 2), undefined behind the eye, and depths (n,) in metres."""
+    """Project points (n, 3) in `stack` to pixels (n, 2), undefined behind the eye, and depths in metres."""
     # A contiguous row per coordinate makes the arithmetic and the reductions several times as fast.
     homogeneous = pixels_from_stack[:, :3] @ points_m.T + pixels_from_stack[:, 3:]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -42,8 +42,8 @@ def project(pixels_from_stack: F64, points_m: F64) -> tuple[F64, F64]:
 
 
 def covered_box(view: View, points_m: F64, *, align_px: int = 32) -> PixelRect:
-    """Return a box, in multiples of `align_px`, that contains the convex hull of points (n, 3) in `stack`, within the
-    raster. It is empty if all points are behind the eye, and the whole raster if some of them are.
+    """Return a box, in multiples of `align_px`, that contains the convex hull of points (n, 3) in
+    `stack`, within the raster. It is empty if all points are behind the eye, and the whole raster if some of them are.
     """
     pixels, depths = project(view.pixels_from_stack, points_m)
     if _bounds(depths)[1] <= 2 * NEAREST_M:

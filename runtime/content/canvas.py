@@ -77,8 +77,8 @@ class _Reducer:
         at_near: float,
         at_far: float,
     ) -> F32:
-        """Return values (rows, columns) linear in the smallest depth of each block, from `at_near` to `at_far`, 0 if
-        empty. `size` is in blocks; `every` and `first` are those of `ContentSource.nearness`.
+        """Return values (rows, columns) linear in the smallest depth of each block, from `at_near` to
+        `at_far`, 0 if empty. `size` is in blocks; `every` and `first` are those of `ContentSource.nearness`.
         """
         if size not in self._targets:
             if len(self._targets) >= SIZES_KEPT:
@@ -111,9 +111,9 @@ class _Reducer:
 
 
 class CanvasSource(ContentSource):
-    """Base class for sources that draw with OpenGL into one framebuffer per view size. Only the box that the content
-    may cover is drawn and has its multiple samples resolved, because resolving is the most expensive step on a software
-    rasteriser. Pixels are read back only on request.
+    """Base class for sources that draw with OpenGL into one framebuffer per view size. Only the box that
+    the content may cover is drawn and has its multiple samples resolved, because resolving is the most expensive step
+    on a software rasteriser. Pixels are read back only on request.
     """
 
     def __init__(self, context: Any, *, info: ContentInfo, samples: int = 0, deep: bool = False) -> None:

@@ -86,8 +86,8 @@ def read_folder(folder: Path, preset: str) -> tuple[Pair, ...]:
 
 
 def prepare(file: SceneFile) -> Callable[..., ContentSource]:
-    """Read a folder of pairs, and return a function that creates the source. By default, the preset is that whose name
-    occurs in the folder's name. Raises InputError if there is none, or if the pairs cannot be read.
+    """Read a folder of pairs, and return a function that creates the source. By default, the preset is
+    that whose name occurs in the folder's name. Raises InputError if there is none, or if the pairs cannot be read.
     """
     path, settings = file.path, file.settings
     name = file.preset or next((name for name in preset_names() if name in path.resolve().name), "")
@@ -105,7 +105,7 @@ def prepare(file: SceneFile) -> Callable[..., ContentSource]:
 
 
 class EyeRealSource(ContentSource):
-    """Source that shows the pair whose left eye is nearest to the viewer's left eye, warped as if at x = 0."""
+    """Source of the pair whose left eye is nearest to the viewer's, warped as if at x = 0."""
 
     def __init__(
         self,

@@ -41,7 +41,7 @@ SKIPPED = 60  # most frames that are decoded in passing instead of seeking
 
 
 class Frames(ABC):
-    """Sequence of pictures that is played in a loop. Constructors raise InputError if the files cannot be shown."""
+    """Sequence of pictures played in a loop. Constructors raise InputError if they cannot be shown."""
 
     count: int  # number of pictures
     rate_hz: float  # pictures per second
@@ -49,8 +49,8 @@ class Frames(ABC):
 
     @abstractmethod
     def frame(self, index: int) -> U8:
-        """Return the frame at `index`, with every view in the layout, as RGB (h, w, 3). Raises ContentFailure if that
-        fails.
+        """Return the frame at `index`, with every view in the layout, as RGB (h, w, 3). Raises ContentFailure
+        if that fails.
         """
 
     def layout(self, index: int) -> Layout:
@@ -65,7 +65,7 @@ class Frames(ABC):
 
 
 class PictureFiles(Frames):
-    """Sequence of still pictures, one per file. Two views in a file, if both are shown, are joined side by side."""
+    """Sequence of still pictures, one per file. If two views are shown, they are joined side by side."""
 
     def __init__(self, paths: Sequence[Path], settings: ContentSettings, *, folder: Path | None = None) -> None:
         """Read the headers of all pictures in order, and decode the first picture that can be decoded. Without
@@ -183,8 +183,8 @@ class Video(Frames):
 
 
 def layout_in(header: Header, path: Path, settings: ContentSettings, folder: Path | None = None) -> Layout:
-    """Return a picture's layout, from the settings, the header, or the name of the file or of `folder`. Two views in a
-    file are side by side, unless the settings request a single view or the cross-eyed order.
+    """Return a picture's layout, from the settings, the header, or the name of the file or of `folder`.
+    Two views in a file are side by side, unless the settings request a single view or the cross-eyed order.
     """
     layout = layout_of(path, settings, stated=header.layout)
     if header.is_around:
@@ -197,7 +197,7 @@ def layout_in(header: Header, path: Path, settings: ContentSettings, folder: Pat
 
 
 def open_frames(path: Path, settings: ContentSettings) -> Frames:
-    """Open a picture, an animation, a video or a folder of pictures. Raises InputError if nothing can be shown."""
+    """Open a picture, an animation, a video or a folder of pictures. Raises InputError."""
     if not path.is_dir():
         if path.suffix.lower() in VIDEOS:
             return Video(path, settings)
@@ -247,8 +247,8 @@ def _why_none(folder: Path) -> str:
 
 
 def read_pair(path: Path, settings: ContentSettings) -> list[U8]:
-    """Read the left and right eye's views from one file, with square pixels, and white where they are transparent.
-    Raises InputError if the file cannot be read, or if it does not contain exactly two views.
+    """Read the left and right eye's views from one file, with square pixels, and white where they are
+    transparent. Raises InputError if the file cannot be read, or if it does not contain exactly two views.
     """
     views = read_views(path)
     if len(views) == 2:

@@ -72,7 +72,7 @@ def edges_of(shape: Shape) -> Edges:
 
 
 class OutlineRamps:
-    """Builds ramps along outlines: quadrilaterals whose coverage falls from 1 at the edge to 0 outside the outline."""
+    """Builds ramps along outlines: quadrilaterals whose coverage falls to 0 outside the outline."""
 
     def __init__(self, parts: Mapping[int, tuple[Edges, F32]]) -> None:
         """Prepare ramps for parts, by number: edges, and vertices (v, 12) of a position in the part's frame and
@@ -84,8 +84,8 @@ class OutlineRamps:
     def along(
         self, seen: Sequence[tuple[int, F64, F64]], *, width_px: int, height_px: int, ramp_px: float = 1.0
     ) -> tuple[F32, list[int]]:
-        """Return ramps (m, 4, CORNER_FLOATS) along the outlines of parts, valid until the next call, and each part's
-        number.
+        """Return ramps (m, 4, CORNER_FLOATS) along the outlines of parts, valid until the next call, and each
+        part's number.
 
         `seen` lists the parts in the order of drawing: number, the eye (3,) in the part's frame, and its 4x4 clip
         matrix. Normals must point outwards. A ramp has two corners on its edge and then two outside the outline: clip

@@ -67,8 +67,8 @@ class Splats:
 
 
 def load_gaussians(header: PlyHeader) -> Gaussians:
-    """Read the usable splats in a PLY file that has the reference implementation's format. Raises InputError if the
-    file is damaged or not binary, a property is missing, or no splat is visible.
+    """Read the usable splats in a PLY file that has the reference implementation's format. Raises
+    InputError if the file is damaged or not binary, a property is missing, or no splat is visible.
     """
     path, table = header.path, read_elements(header)["vertex"]
     if not len(table):
@@ -101,8 +101,9 @@ def load_gaussians(header: PlyHeader) -> Gaussians:
 
 
 def drawable(path: Path, *, centres: F32, log_scales: F32, quaternions: F32, logits: F32, harmonics: F32) -> Gaussians:
-    """Return the splats that can be drawn, given centres (n, 3), natural logarithms of the deviations (n, 3), rotations
-    as quaternions (n, 4) in w, x, y, z order and of any length above 0, opacity logits (n,), and harmonics (n, k, 3).
+    """Return the splats that can be drawn, given centres (n, 3), natural logarithms of the deviations (n,
+    3), rotations as quaternions (n, 4) in w, x, y, z order and of any length above 0, opacity logits (n,), and
+    harmonics (n, k, 3).
 
     Splats that are not finite, have no rotation, or are much larger than the scene are dropped, and their number is
     logged. Raises InputError, which names `path`, if no visible splats remain.
@@ -136,7 +137,7 @@ def flat_harmonics(colours: F32) -> F32:
 
 
 def with_higher(flat: F32, higher: NDArray[Any], *, zero: float = 0.0, unit: float = 1.0) -> F32:
-    """Append higher harmonics (n, k - 1, 3), encoded as value / unit + zero, to those of degree 0 (n, 1, 3)."""
+    """Append higher harmonics (n, k - 1, 3), encoded as value / unit + zero, to those of degree 0."""
     harmonics = np.empty((len(flat), 1 + higher.shape[1], 3), np.float32)
     harmonics[:, :1], harmonics[:, 1:] = flat, higher
     harmonics[:, 1:] -= np.float32(zero)
@@ -145,7 +146,7 @@ def with_higher(flat: F32, higher: NDArray[Any], *, zero: float = 0.0, unit: flo
 
 
 def dotted(ends: F32, colours: F32) -> tuple[F32, F32]:
-    """Convert lines' ends (n, 2, 3) and colours to dense points (m, 3), with colours interpolated along each line."""
+    """Convert lines' ends (n, 2, 3) and colours to dense points (m, 3) with interpolated colours."""
     lengths = np.nan_to_num(np.linalg.norm(np.diff(ends.astype(np.float64), axis=1)[:, 0], axis=1))
     share = np.minimum(lengths / max(float(lengths.sum()), 1e-30), 1.0)
     counts = 2 + (share * min(DOTS * len(ends), MOST_DOTS)).astype(np.int64)
@@ -157,9 +158,9 @@ def dotted(ends: F32, colours: F32) -> tuple[F32, F32]:
 
 
 def of_points(places: F32, colours: F32) -> Gaussians:
-    """Convert points (n, 3) to small round splats that are about as large as the spacing between the points. Colours
-    (n, 3) are 0-1. A point whose colour is NaN is coloured by its position, because nothing but an outline would be
-    visible if all points had one colour.
+    """Convert points (n, 3) to small round splats that are about as large as the spacing between the
+    points. Colours (n, 3) are 0-1. A point whose colour is NaN is coloured by its position, because nothing but an
+    outline would be visible if all points had one colour.
     """
     low, high = np.percentile(places, [1, 99], axis=0)
     by_place = 0.25 + 0.7 * np.clip((places - low) / np.maximum(high - low, 1e-30), 0, 1)
@@ -175,8 +176,8 @@ def of_points(places: F32, colours: F32) -> Gaussians:
 
 
 def bounds(gaussians: Gaussians) -> tuple[F64, F64]:
-    """Return the lowest and highest corner (3,) of the splats, including two deviations but not faint splats and
-    outliers.
+    """Return the lowest and highest corner (3,) of the splats, including two deviations but not faint
+    splats and outliers.
     """
     seen = gaussians.opacities > FAINT
     seen = seen if seen.any() else np.ones_like(seen)
@@ -188,8 +189,8 @@ def bounds(gaussians: Gaussians) -> tuple[F64, F64]:
 
 
 def covariances_of(scales: F32, quaternions: F32) -> F32:
-    """Return the covariances R diag(s²) R^T, packed as (n, 6), of deviations s (n, 3) and quaternions (n, 4), w, x, y,
-    z.
+    """Return the covariances R diag(s²) R^T, packed as (n, 6), of deviations s (n, 3) and quaternions (n,
+    4), w, x, y, z.
     """
     packed = np.empty((len(scales), 6), np.float32)
     for first in range(0, len(scales), AT_ONCE):
@@ -213,9 +214,9 @@ def moved(gaussians: Gaussians, target_from_source: F64) -> Gaussians:
 
 
 def seen_splats(gaussians: Gaussians, view: View) -> Splats:
-    """Project the splats in `stack` to first order (EWA, Zwicker et al. 2001), and sort them by distance. The view's
-    3x4 projection P may map to a panel's pixels or to those of an eye's image. Pixel coordinate u_i has the Jacobian
-    (P_i - u_i P_3) / w. Splats nearer to the eye than `NEAREST_M` are left out.
+    """Project the splats in `stack` to first order (EWA, Zwicker et al. 2001), and sort them by distance.
+    The view's 3x4 projection P may map to a panel's pixels or to those of an eye's image. Pixel coordinate u_i has the
+    Jacobian (P_i - u_i P_3) / w. Splats nearer to the eye than `NEAREST_M` are left out.
     """
     projection = view.pixels_from_stack.astype(np.float32)
     homogeneous = gaussians.centres @ projection[:, :3].T + projection[:, 3]
@@ -258,9 +259,9 @@ def seen_splats(gaussians: Gaussians, view: View) -> Splats:
 
 
 def nearest_blocks(splats: Splats, view: View, *, every: int, first: tuple[int, int]) -> F32:
-    """Return the inverse distances (h, w), in 1/m, to the nearest splats whose alpha exceeds `SOLID`, as `nearness`
-    does. Each splat is treated as a square at the distance of its centre, as large as the area where alpha exceeds
-    `SOLID`, except that half its side, in blocks, is rounded down to 0 or a power of two.
+    """Return the inverse distances (h, w), in 1/m, to the nearest splats whose alpha exceeds `SOLID`, as
+    `nearness` does. Each splat is treated as a square at the distance of its centre, as large as the area where alpha
+    exceeds `SOLID`, except that half its side, in blocks, is rounded down to 0 or a power of two.
     """
     shape = -(-(view.height_px + first[1]) // every), -(-(view.width_px + first[0]) // every)
     solid = np.flatnonzero(splats.opacities > SOLID)  # farthest first
@@ -281,8 +282,8 @@ def nearest_blocks(splats: Splats, view: View, *, every: int, first: tuple[int, 
 
 
 def harmonic_basis(directions: F32, count: int) -> F32:
-    """Return the first `count` real spherical harmonics (n, count) for unit directions (n, 3), in the reference's
-    order.
+    """Return the first `count` real spherical harmonics (n, count) for unit directions (n, 3), in the
+    reference's order.
     """
     x, y, z = directions.T
     basis = [np.full_like(x, FLAT_HARMONIC)]
@@ -308,8 +309,8 @@ def harmonic_basis(directions: F32, count: int) -> F32:
 
 
 def colours_towards(harmonics: F32, directions: F32) -> F32:
-    """Return the colours (n, 3), clipped at 0, of harmonics (n, k, 3) in unit directions (n, 3) from the eye, in their
-    frame.
+    """Return the colours (n, 3), clipped at 0, of harmonics (n, k, 3) in unit directions (n, 3) from the
+    eye, in their frame.
     """
     if harmonics.shape[1] == 1:
         return np.asarray(np.maximum(harmonics[:, 0] * np.float32(FLAT_HARMONIC) + np.float32(0.5), 0))

@@ -43,8 +43,8 @@ WAY_OUT = "save the model without that compression, with Blender or `gltf-transf
 
 
 class GltfFile:
-    """Reads objects in a glTF 2.0 file by number. All methods raise LookupError, TypeError or ValueError if the file is
-    malformed, and InputError if data are missing, unsupported or larger than a limit.
+    """Reads objects in a glTF 2.0 file by number. All methods raise LookupError, TypeError or ValueError
+    if the file is malformed, and InputError if data are missing, unsupported or larger than a limit.
     """
 
     def __init__(self, path: Path, data: bytes, read: Read) -> None:
@@ -75,8 +75,8 @@ class GltfFile:
         return _count(self.item("accessors", accessor))
 
     def accessor(self, index: int, *, rows: Array | None = None, as_float: bool = True) -> Array:
-        """Return an accessor's elements (n, ...), all or those of `rows`, as float32 by `fractions` unless `as_float`
-        is False.
+        """Return an accessor's elements (n, ...), all or those of `rows`, as float32 by `fractions` unless
+        `as_float` is False.
         """
         accessor = self.item("accessors", index)
         values = self._stored(accessor)
@@ -145,8 +145,8 @@ class GltfFile:
             raise ValueError(f"a data URI is not valid base64: {error}") from None
 
     def picture(self, texture: Table) -> U8:
-        """Return a texture's picture as RGBA (h, w, 4). Call `check_pictures` first. Raises InputError if it cannot be
-        decoded.
+        """Return a texture's picture as RGBA (h, w, 4). Call `check_pictures` first. Raises InputError if it
+        cannot be decoded.
         """
         number = self._image_of(texture)
         if number not in self._pictures:
@@ -155,7 +155,7 @@ class GltfFile:
         return self._pictures[number]
 
     def check_pictures(self, textures: list[Table]) -> None:
-        """Check all pictures' headers. Raises InputError if one picture, or all together, have too many pixels."""
+        """Check all pictures' headers. Raises InputError if one, or all together, have too many pixels."""
         pixels = 0
         for number in sorted({self._image_of(texture) for texture in textures}):
             coded = self._coded(number)

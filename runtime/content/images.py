@@ -18,8 +18,9 @@ def rgba_from_rgb(rgb: U8) -> U8:
 
 
 def image_from_view(image_from_stack: F64, pixels_from_stack: F64) -> F64 | None:
-    """Return the 3x3 homography from a view's pixels to those of a picture shown on the plane x = 0, given 3x4
-    projections. Any other plane gives the same result for one eye position. None if the view's eye is in the plane.
+    """Return the 3x3 homography from a view's pixels to those of a picture shown on the plane x = 0,
+    given 3x4 projections. Any other plane gives the same result for one eye position. None if the view's eye is in the
+    plane.
     """
     # This raster's pixel coordinates are metres along y (u) and -z (v).
     plane = PlaneRaster(x_m=0.0, left_m=0.0, top_m=0.0, pitch_u_m=1.0, pitch_v_m=1.0, width_px=1, height_px=1)
@@ -28,7 +29,7 @@ def image_from_view(image_from_stack: F64, pixels_from_stack: F64) -> F64 | None
 
 
 def plane_from_pixels(pixels_from_stack: F64, plane: PlaneRaster) -> F64 | None:
-    """Return the 3x3 homography from a view's pixels to a plane's pixels, or None if the view's eye is in the plane."""
+    """Return the 3x3 homography from a view's to a plane's pixels, or None if its eye is in the plane."""
     try:
         return panel_from_image(pixels_from_stack, plane)
     except ValueError:
@@ -36,8 +37,8 @@ def plane_from_pixels(pixels_from_stack: F64, plane: PlaneRaster) -> F64 | None:
 
 
 def reduction(picture_from_view: F64, view: View) -> int:
-    """Return how many times to halve a picture before warping it, to limit aliasing. Neighbouring pixels in the middle
-    of the view are then less than 1.5 picture pixels apart along an axis.
+    """Return how many times to halve a picture before warping it, to limit aliasing. Neighbouring pixels
+    in the middle of the view are then less than 1.5 picture pixels apart along an axis.
     """
     middle = np.array([view.width_px, view.height_px]) / 2 + np.array([[0, 0], [1, 0], [0, 1]])
     mapped = cv2.perspectiveTransform(middle[None], picture_from_view)[0]
@@ -54,9 +55,9 @@ class WarpedPicture:
         self._out: dict[tuple[int, int, int], U8] = {}
 
     def warped(self, picture_from_view: F64 | None, view: View) -> U8:
-        """Return the picture warped to the view's raster, RGBA (h, w, 4), by a homography (3, 3) from the view's
-        pixels. Pixels outside the picture, or all without a homography, have the background's colour and alpha 0. The
-        next call for the same size and side overwrites the array.
+        """Return the picture warped to the view's raster, RGBA (h, w, 4), by a homography (3, 3) from the
+        view's pixels. Pixels outside the picture, or all without a homography, have the background's colour and alpha
+        0. The next call for the same size and side overwrites the array.
         """
         key = (view.width_px, view.height_px, view.side)
         if key not in self._out:

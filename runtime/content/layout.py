@@ -1,4 +1,4 @@
-"""Arrangement of views in a picture, taken from settings, file headers or names; similar halves give a hint."""
+"""Arrangement of views in a picture, by settings, header, name, or, as a hint, similar halves."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Layout:
     sample_aspect: float = 1.0  # width over height of a film's pixels
 
     def views(self, picture: U8) -> list[U8]:
-        """Split a picture into its views, as `parts` does, and crop equirectangular ones to what is straight ahead."""
+        """Split a picture into its views, as `parts` does, and crop equirectangular ones to the middle."""
         parts = self.parts(picture)
         height, width = parts[0].shape[:2]
         squeezed = (1.0, 0.5, 2.0) if len(parts) == 2 else (1.0,)  # names need not state that views are squeezed
@@ -64,8 +64,8 @@ class Layout:
         return [ahead(part, self.span_deg) for part in parts]
 
     def parts(self, picture: U8) -> list[U8]:
-        """Split a picture into [left, right], a single view, or a quilt's views from the leftmost to the rightmost
-        camera. Raises ValueError if the picture is smaller than one pixel per view.
+        """Split a picture into [left, right], a single view, or a quilt's views from the leftmost to the
+        rightmost camera. Raises ValueError if the picture is smaller than one pixel per view.
         """
         height, width = picture.shape[:2]
         if not 0 < self.columns <= width or not 0 < self.rows <= height:
@@ -98,8 +98,8 @@ MONO, PAIR = Layout("mono"), Layout("side-by-side", columns=2)  # PAIR is for fi
 
 
 def layout_of(path: Path, settings: ContentSettings, *, stated: str = "") -> Layout:
-    """Return a file's or folder's layout from the settings, its header (`stated`, as in `content.layout`) or its name.
-    Raises InputError if a quilt has no views, or an implausible aspect ratio.
+    """Return a file's or folder's layout from the settings, its header (`stated`, as in `content.layout`)
+    or its name. Raises InputError if a quilt has no views, or an implausible aspect ratio.
     """
     named = settings.layout
     if named == "auto":
@@ -120,8 +120,8 @@ def layout_of(path: Path, settings: ContentSettings, *, stated: str = "") -> Lay
 
 
 def of_film(layout: Layout, path: Path, *, width_px: int, height_px: int) -> Layout:
-    """Return a film's layout, with squeezed views if the frame has the shape of a single view. A mark such as `full` in
-    its name means that the views are not squeezed.
+    """Return a film's layout, with squeezed views if the frame has the shape of a single view. A mark
+    such as `full` in its name means that the views are not squeezed.
     """
     aspect = width_px / height_px
     squeezed = {"side-by-side": aspect < NARROW, "top-bottom": aspect > LOW}.get(layout.kind, False)
@@ -153,8 +153,8 @@ def _span_deg(path: Path) -> int:
 
 
 def hint(picture: U8) -> str:
-    """Return a picture's probable layout, or an empty string: its halves may be views if they correlate after a small
-    shift.
+    """Return a picture's probable layout, or an empty string: its halves may be views if they correlate
+    after a small shift.
     """
     for layout in ("side-by-side", "top-bottom"):
         columns = 2 if layout == "side-by-side" else 1

@@ -47,8 +47,8 @@ class MeshData:
 
 
 def prepare(file: SceneFile) -> Callable[..., ContentSource]:
-    """Read a mesh file, and return a function that creates the source in a GL context. Raises InputError if that fails.
-    The edges of small meshes are found at this stage, because doing so needs no GL context.
+    """Read a mesh file, and return a function that creates the source in a GL context. Raises InputError
+    if that fails. The edges of small meshes are found at this stage, because doing so needs no GL context.
     """
     data = load_mesh(file.path)
     if data.left_out:
@@ -69,8 +69,8 @@ def prepare(file: SceneFile) -> Callable[..., ContentSource]:
 
 
 def load_mesh(path: Path) -> MeshData:
-    """Read a mesh file. Raises InputError if it is damaged, exceeds a limit, is not finite, or contains nothing to
-    draw.
+    """Read a mesh file. Raises InputError if it is damaged, exceeds a limit, is not finite, or contains
+    nothing to draw.
     """
     progress.tell(f"reading {path.name}", 0)
     data = untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)
@@ -119,9 +119,9 @@ def load_mesh(path: Path) -> MeshData:
 
 
 def folder_reader(path: Path, field: str) -> Callable[[str], bytes]:
-    """Return a function that reads, once, the files a mesh refers to by URI or path; `field` names the kind of
-    reference. It raises InputError if a reference is not a relative path to a readable file in the mesh's folder or
-    below.
+    """Return a function that reads, once, the files a mesh refers to by URI or path; `field` names the
+    kind of reference. It raises InputError if a reference is not a relative path to a readable file in the mesh's
+    folder or below.
     """
     read_files: dict[str, bytes] = {}
 

@@ -36,9 +36,9 @@ DRIVE = re.compile(r"[A-Za-z]:.*/")  # folder on the author's Windows machine, w
 
 
 class FolderResolver(trimesh.resolvers.FilePathResolver):
-    """Resolver that trimesh's loaders use to read the files a mesh refers to. A missing material file is replaced by an
-    empty file, and a missing texture by a grey one. Other problems are stored in `refused`, because the loaders discard
-    exceptions.
+    """Resolver that trimesh's loaders use to read the files a mesh refers to. A missing material file is
+    replaced by an empty file, and a missing texture by a grey one. Other problems are stored in `refused`, because the
+    loaders discard exceptions.
     """
 
     def __init__(self, path: Path, read: Read, *, has_materials: bool) -> None:
@@ -79,8 +79,8 @@ class FolderResolver(trimesh.resolvers.FilePathResolver):
 
 
 def read_mesh(path: Path, data: bytes, read: Read, origin: Origin) -> tuple[list[Part], list[tuple[F32, F32]]]:
-    """Convert a mesh file's triangles to parts, and its points or lines to positions (n, 3) and colours (n, 3). `read`
-    reads other files; `origin` is subtracted. Raises InputError if a file is damaged or missing.
+    """Convert a mesh file's triangles to parts, and its points or lines to positions (n, 3) and colours
+    (n, 3). `read` reads other files; `origin` is subtracted. Raises InputError if a file is damaged or missing.
     """
     kind = path.suffix.lower().removeprefix(".")
     progress.tell(f"{path.name}: triangles", 0)

@@ -23,8 +23,8 @@ U32 = NDArray[np.uint32]
 
 @np.errstate(all="ignore")
 def load_compressed(header: PlyHeader) -> Gaussians:
-    """Read a PLY file compressed by SuperSplat: 8- to 11-bit fractions of the bounds of a chunk of splats. Raises
-    InputError if it is damaged, bounds or harmonics are missing for some splats, or no splat is visible.
+    """Read a PLY file compressed by SuperSplat: 8- to 11-bit fractions of the bounds of a chunk of
+    splats. Raises InputError if it is damaged, bounds or harmonics are missing for some splats, or no splat is visible.
     """
     elements = read_elements(header)
     splats, bounds = elements["vertex"], elements.get("chunk")
@@ -64,8 +64,8 @@ def load_compressed(header: PlyHeader) -> Gaussians:
 
 @np.errstate(all="ignore")
 def load_splat(path: Path) -> Gaussians:
-    """Read a .splat file: position, scale, RGBA colour and rotation in 32 bytes per splat. Raises InputError if its
-    size is not a positive multiple of 32 bytes, or no splat is visible.
+    """Read a .splat file: position, scale, RGBA colour and rotation in 32 bytes per splat. Raises
+    InputError if its size is not a positive multiple of 32 bytes, or no splat is visible.
     """
     data = untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)
     if not data or len(data) % SPLAT.itemsize:
@@ -87,7 +87,7 @@ def load_splat(path: Path) -> Gaussians:
 
 
 def fields_of(packed: U32, bits: tuple[int, ...]) -> F32:
-    """Unpack bit fields, highest first and `bits` wide, of words (n,) to fractions of their maxima (n, len(bits))."""
+    """Unpack bit fields, highest first, of words (n,) to fractions of their maxima (n, len(bits))."""
     parts = []
     for width in reversed(bits):
         most = (1 << width) - 1
@@ -108,8 +108,8 @@ def _turns(packed: U32) -> F32:
 
 
 def with_largest(three: NDArray[np.floating[Any]], number: NDArray[np.integer[Any]]) -> F32:
-    """Return unit quaternions (n, 4) from three components each (n, 3), and the index (n,) of the missing, largest one.
-    If an index is above 3, the quaternion is zero.
+    """Return unit quaternions (n, 4) from three components each (n, 3), and the index (n,) of the
+    missing, largest one. If an index is above 3, the quaternion is zero.
     """
     largest = np.sqrt(np.maximum(1 - (three**2).sum(1), 0))
     quaternions = np.zeros((len(three), 4), np.float32)

@@ -20,7 +20,7 @@ def is_around(width: float, height: float, span_deg: int) -> bool:
 
 
 def ahead(view: U8, span_deg: int) -> U8:
-    """Return the middle of an equirectangular view (h, w, 3), reprojected to a pinhole camera of similar resolution."""
+    """Middle of an equirectangular view (h, w, 3), reprojected to a pinhole camera of similar resolution."""
     u, v = _places(view.shape[1], view.shape[0], span_deg)
     return np.asarray(cv2.remap(view, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 

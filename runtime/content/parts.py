@@ -88,8 +88,8 @@ def coded(light: ArrayLike) -> F32:
 
 
 def merged(parts: Sequence[Part]) -> list[Part]:
-    """Merge parts with equal materials, whose colours and opacities become vertex colours, up to `OUTLINED_MAX`
-    triangles.
+    """Merge parts with equal materials, whose colours and opacities become vertex colours, up to
+    `OUTLINED_MAX` triangles.
     """
     alike: dict[tuple[object, ...], list[list[Part]]] = {}
     counts: dict[tuple[object, ...], int] = {}  # triangles in the last group

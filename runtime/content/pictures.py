@@ -17,7 +17,7 @@ from runtime.records import U8
 
 
 def screen(stack: PanelStack, *, width_px: int, height_px: int, pixel_aspect: float = 1.0) -> PlaneRaster:
-    """Return a picture's grid on the plane x = 0, fitted to the display. `pixel_aspect`: pixel width / height."""
+    """Return a picture's grid, of pixels with this width / height, on x = 0, fitted to the display."""
     pitch_m = min(stack.width_m / (width_px * pixel_aspect), stack.height_m / height_px)
     return PlaneRaster(
         x_m=0.0,
@@ -31,8 +31,8 @@ def screen(stack: PanelStack, *, width_px: int, height_px: int, pixel_aspect: fl
 
 
 def prepare(file: SceneFile) -> Callable[..., ContentSource]:
-    """Open a picture, a video or a folder of pictures, and return a function that creates the source. Raises InputError
-    if the file cannot be shown, or if its first picture is too small for its layout.
+    """Open a picture, a video or a folder of pictures, and return a function that creates the source.
+    Raises InputError if the file cannot be shown, or if its first picture is too small for its layout.
     """
     frames = open_frames(file.path, file.settings)
     make = partial(PicturesSource, frames, file=file)

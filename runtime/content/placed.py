@@ -23,7 +23,7 @@ NS_PER_MIN = 60 * NS_PER_S
 
 @dataclass(frozen=True, slots=True)
 class Placing:
-    """A scene's placement p_stack = offset + scale · R · p_scene; R is `rotation_deg`, then the turntable."""
+    """Placement p_stack = offset + scale · R · p_scene; R is `rotation_deg`, then the turntable."""
 
     scale: float = 1.0
     offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # frame `stack`

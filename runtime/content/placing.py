@@ -76,9 +76,9 @@ class SceneFile:
 
 
 def guessed_axes(low: F64, high: F64) -> tuple[str, str]:
-    """Guess the content's axes (up, towards the viewer) from its corners (3,): either (+y, +z) or (+z, -y). Objects
-    often stand on the ground at height 0. If only one of the y and z ranges begins near 0 or above, that axis is taken
-    to be up. Otherwise, the longer axis is.
+    """Guess the content's axes (up, towards the viewer) from its corners (3,): either (+y, +z) or (+z,
+    -y). Objects often stand on the ground at height 0. If only one of the y and z ranges begins near 0 or above, that
+    axis is taken to be up. Otherwise, the longer axis is.
     """
     size = np.maximum(high - low, 1e-30)
     y, z = np.maximum(low / size + 0.5, 0.0)[1:]  # 0 if centred on the origin, 0.5 if it begins there
@@ -87,9 +87,9 @@ def guessed_axes(low: F64, high: F64) -> tuple[str, str]:
 
 
 def turned_to_viewer(up: str, out: str, *, size: F64, facing: F64) -> tuple[str, str]:
-    """Return axes (up, towards the viewer) that let a flat mesh's front, of mean normal `facing` (3,), face the viewer.
-    A mesh that is flat along the up axis is shown from above, with its near edge at the bottom. If a mesh is not flat,
-    its axes are returned unchanged.
+    """Return axes (up, towards the viewer) that let a flat mesh's front, of mean normal `facing` (3,),
+    face the viewer. A mesh that is flat along the up axis is shown from above, with its near edge at the bottom. If a
+    mesh is not flat, its axes are returned unchanged.
     """
     thinnest = int(size.argmin())
     axis = "xyz"[thinnest]
@@ -108,9 +108,9 @@ def _opposite(axis: str) -> str:
 
 
 def fitted(low: F64, high: F64, *, axes: F64, stack: PanelStack, depth_m: tuple[float, float]) -> F64:
-    """Return the 4x4 stack_from_scene matrix that scales and centres a box, corners (3,) in its frame, to fit the
-    display. `axes` is the scene_from_stack rotation. A scene deeper than the range `depth_m` (x: rear, front) begins at
-    its front and extends beyond the rear, where it is mostly hidden.
+    """Return the 4x4 stack_from_scene matrix that scales and centres a box, corners (3,) in its frame, to
+    fit the display. `axes` is the scene_from_stack rotation. A scene deeper than the range `depth_m` (x: rear, front)
+    begins at its front and extends beyond the rear, where it is mostly hidden.
     """
     size = np.abs(axes.T @ (high - low))
     room = np.array([DEEPER * (depth_m[1] - depth_m[0]), stack.width_m * FILL, stack.height_m * FILL])

@@ -62,8 +62,8 @@ class Playlist:
 
 
 def read_playlist(path: Path, settings: ContentSettings) -> Playlist:
-    """Read a playlist file. `settings` are the entries' defaults, except for the placement, which applies to the whole.
-    Raises InputError, which names the file, the entry and the field, if it is not valid.
+    """Read a playlist file. `settings` are the entries' defaults, except for the placement, which applies
+    to the whole. Raises InputError, which names the file, the entry and the field, if it is not valid.
     """
     table = read_table(path)
     if "frames" in table and "show" not in table:
@@ -120,8 +120,8 @@ class PlaylistSource(ForwardingSource):
         return self._sources[self._number % len(self._sources)]
 
     def describe(self, *, time_ns: int) -> dict[str, Any]:
-        """Return the status: `entries` (scenes and durations), `index` (current) and `left_s` (None if the scene
-        stays).
+        """Return the status: `entries` (scenes and durations), `index` (current) and `left_s` (None if the
+        scene stays).
         """
         entries = [{"scene": entry.scene, "seconds": entry.seconds} for entry in self._list.entries]
         index, since_ns = self._at(time_ns)

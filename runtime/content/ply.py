@@ -52,8 +52,8 @@ class PlyHeader:
 
 
 def read_header(path: Path) -> PlyHeader:
-    """Read a PLY file's header. Raises InputError if it is missing, incomplete or not understood, or if a count exceeds
-    a limit or the file's size.
+    """Read a PLY file's header. Raises InputError if it is missing, incomplete or not understood, or if a
+    count exceeds a limit or the file's size.
     """
     with untrusted_input.open_regular(path, most_bytes=LIMITS.file_bytes) as file:
         head = file.read(LONGEST_HEADER)
@@ -93,8 +93,9 @@ def read_header(path: Path) -> PlyHeader:
 
 
 def read_elements(header: PlyHeader) -> dict[str, Table]:
-    """Read the elements in a binary PLY file as structured arrays, by name, up to the first that has a list property.
-    Raises InputError if the file is cut off or in text form, or if the vertices have not been read by then.
+    """Read the elements in a binary PLY file as structured arrays, by name, up to the first that has a
+    list property. Raises InputError if the file is cut off or in text form, or if the vertices have not been read by
+    then.
     """
     path, place, found = header.path, header.starts_at, dict[str, Table]()
     if header.order == "ascii":

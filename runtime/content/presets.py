@@ -30,8 +30,8 @@ def preset_names() -> tuple[str, ...]:
 
 
 def stack_from_preset(name: str) -> F64:
-    """Return the 4x4 map from scene units to metres in `stack` (supplement): R · p / (100 r_p2d) + t, r_p2d in units
-    per cm.
+    """Return the 4x4 map from scene units to metres in `stack` (supplement): R · p / (100 r_p2d) + t,
+    r_p2d in units per cm.
     """
     table, matrix = preset_file()["scene"][name], np.eye(4)
     rotation = rotation_matrix(table["rotation_deg"], preset_file()["rotation_order"])
@@ -41,9 +41,9 @@ def stack_from_preset(name: str) -> F64:
 
 
 def drawn_scene_from_stack(name: str) -> F64:
-    """Return the 4x4 map from metres in `stack` to scene units, as used by the published code that drew the data set.
-    Its scales differ from the supplement's. It also aligns the panels with the scene's axes, and places them
-    differently for evaluation.
+    """Return the 4x4 map from metres in `stack` to scene units, as used by the published code that drew
+    the data set. Its scales differ from the supplement's. It also aligns the panels with the scene's axes, and places
+    them differently for evaluation.
     """
     code, matrix = preset_file()["scene"][name]["published"], np.eye(4)
     axes = axes_matrix(out=code["out"], up=code["up"])
@@ -56,15 +56,15 @@ def drawn_scene_from_stack(name: str) -> F64:
 
 
 def rotation_matrix(angles_deg: Triple, order: str) -> F64:
-    """Return the 3x3 rotation by angles about x, y and z, about fixed (`xyz`) or moving axes (`XYZ`), as SciPy orders
-    them.
+    """Return the 3x3 rotation by angles about x, y and z, about fixed (`xyz`) or moving axes (`XYZ`), as
+    SciPy orders them.
     """
     angles = [angles_deg["xyz".index(letter)] for letter in order.lower()]
     return np.asarray(Rotation.from_euler(order, angles, degrees=True).as_matrix())
 
 
 def axes_matrix(*, out: str, up: str) -> F64:
-    """Return the 3x3 scene_from_stack rotation, whose columns point out, right and up, given axes such as `+z`."""
+    """Return the 3x3 scene_from_stack rotation: columns out, right and up, given axes such as `+z`."""
     columns = []
     for axis in (out, up):
         column = np.zeros(3)

@@ -20,7 +20,7 @@ MODELLED_HEIGHT_M = 0.2916  # display height that the scenes' lengths are meant 
 
 
 def parts_of(built_in: Scene) -> list[DrawnPart]:
-    """Prepare a scene's parts, one per object: the slow half of opening it, on any thread, without a GL context."""
+    """Prepare a scene's parts, one per object: the slow half of opening it, without a GL context."""
     pictures = {name: textures.texture(name) for name in {thing.texture for thing in built_in.things}}
     return [
         DrawnPart(

@@ -1,7 +1,4 @@
-"""Pictures drawn on request by another program, such as a renderer, a game or a web page (docs/programs.md).
-
-If an answer is late or missing, the last pictures stay on the display.
-"""
+"""Pictures drawn on request by another program, such as a renderer or a game (docs/programs.md)."""
 
 from __future__ import annotations
 
@@ -31,8 +28,8 @@ class ProgramOptions(Section):
 
 
 def prepare(file: SceneFile) -> Callable[[Any], ContentSource]:
-    """Start listening for drawing programs, and return a function that creates the source. Raises InputError if the
-    options are invalid or the port cannot be opened.
+    """Start listening for drawing programs, and return a function that creates the source. Raises
+    InputError if the options are invalid or the port cannot be opened.
     """
     options = validated(ProgramOptions, file.settings.options, source="content.options")
     display_m = file.stack.width_m, file.stack.height_m
@@ -41,8 +38,8 @@ def prepare(file: SceneFile) -> Callable[[Any], ContentSource]:
 
 
 def camera_of(view: View) -> dict[str, Any]:
-    """Describe a view, in the form sent to programs: the eye's side and position, and view and projection matrices.
-    Matrices are column-major lists for OpenGL, lengths in metres, depth in [-1, 1].
+    """Describe a view, in the form sent to programs: the eye's side and position, and view and projection
+    matrices. Matrices are column-major lists for OpenGL, lengths in metres, depth in [-1, 1].
     """
     pixels = view.pixels_from_stack
     forward = pixels[2, :3] / np.linalg.norm(pixels[2, :3])
@@ -107,8 +104,8 @@ class ProgramSource(ContentSource):
 
 
 def nearness_of(depth: NDArray[Any], *, every: int, first: tuple[int, int]) -> F32:
-    """Return the inverse distance to the nearest point in each block of a depth picture, in 1/m, as `nearness` does.
-    `depth` are (h, w) values of a depth buffer drawn with `camera_of`'s projection: 0-1, or 0-65535.
+    """Return the inverse distance to the nearest point in each block of a depth picture, in 1/m, as
+    `nearness` does. `depth` are (h, w) values of a depth buffer drawn with `camera_of`'s projection: 0-1, or 0-65535.
     """
     farthest = 65535 if depth.dtype == np.uint16 else 1
     rows, columns = (-(-(size + start) // every) for size, start in zip(depth.shape, first[::-1]))

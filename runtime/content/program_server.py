@@ -110,8 +110,8 @@ class _Form:
         return (4 + depth_bytes) * self.width_px * self.height_px
 
     def picture(self, data: memoryview) -> ProgramPicture:
-        """Return the picture in a message or in shared memory, uncopied. Raises ValueError if the data has the wrong
-        size.
+        """Return the picture in a message or in shared memory, uncopied. Raises ValueError if the data has
+        the wrong size.
         """
         if len(data) != self.bytes:
             parts = "RGBA pixels" if self.depth is None else f"RGBA pixels and {self.depth.name} depths"
@@ -255,9 +255,9 @@ class _Client:
 
 
 class ProgramServer:
-    """Server that drawing programs connect to in order to receive requests and send pictures. The program that
-    connected last does the drawing. Programs that only listen receive the same requests. The methods may be called on
-    any thread. None waits for a program, except for `drawn`.
+    """Server that drawing programs connect to in order to receive requests and send pictures. The program
+    that connected last does the drawing. Programs that only listen receive the same requests. The methods may be called
+    on any thread. None waits for a program, except for `drawn`.
     """
 
     def __init__(self, port: int, token: str) -> None:
@@ -284,8 +284,8 @@ class ProgramServer:
         )
 
     def ask(self, asked: AskedViews) -> int:
-        """Request a frame's pictures, and return its number. Raises ContentFailure without a program or with too many
-        unanswered.
+        """Request a frame's pictures, and return its number. Raises ContentFailure without a program or with
+        too many unanswered.
         """
         now_s = time.monotonic()
         with self._changed:
@@ -480,9 +480,9 @@ _addresses: dict[int, tuple[int, str]] = {}  # port and token of the last server
 
 
 def acquire(port: int) -> ProgramServer:
-    """Return the server for a TCP port, 0 for any, which the caller must `release`. Raises InputError if it cannot be
-    opened. The address, with the token, stays the same for the life of the process if the port is still free, so that
-    programs find the server again after a scene or the solver has been restarted.
+    """Return the server for a TCP port, 0 for any, which the caller must `release`. Raises InputError if
+    it cannot be opened. The address, with the token, stays the same for the life of the process if the port is still
+    free, so that programs find the server again after a scene or the solver has been restarted.
     """
     with _lock:
         server, users = _servers.get(port, (None, 0))

@@ -52,8 +52,8 @@ Opener = Callable[..., ContentSource]  # creates a source, given the keyword arg
 
 
 def open_content(settings: ContentSettings, stack: PanelStack, context: Any) -> ContentSource:
-    """Open the scene that the settings specify: a built-in scene, a preset, a class, a file or a folder. `context` is
-    the moderngl context of the thread that will use it. Raises InputError, which names file and field.
+    """Open the scene that the settings specify: a built-in scene, a preset, a class, a file or a folder.
+    `context` is the moderngl context of the thread that will use it. Raises InputError, which names file and field.
     """
     return prepare_content(settings, stack)(context=context)
 

@@ -45,8 +45,8 @@ Mask = NDArray[np.bool_]
 
 
 def split_rgbd(rgb: U8, path: Path) -> tuple[U8, F32]:
-    """Split a picture into colour (left half) and depth (right half). Raises InputError if it is too small, or if the
-    right half is not grey.
+    """Split a picture into colour (left half) and depth (right half). Raises InputError if it is too
+    small, or if the right half is not grey.
     """
     width = rgb.shape[1] // 2
     if width < 2 or rgb.shape[0] < 2:
@@ -58,9 +58,9 @@ def split_rgbd(rgb: U8, path: Path) -> tuple[U8, F32]:
 
 
 def surfaces(colour: U8, depth: F32, *, stack: PanelStack, depth_m: tuple[float, float]) -> list[Part]:
-    """Return the front surface and, if there are edges, the background. Depths 0 and 1 are at x = `depth_m` in `stack`.
-    Each point is on the ray from the nominal eye position through its pixel of the picture, which is fitted to the
-    panels.
+    """Return the front surface and, if there are edges, the background. Depths 0 and 1 are at x =
+    `depth_m` in `stack`. Each point is on the ray from the nominal eye position through its pixel of the picture, which
+    is fitted to the panels.
     """
     depth = sharpened(depth)
     colour = unmixed(colour, depth)
@@ -84,7 +84,7 @@ def surfaces(colour: U8, depth: F32, *, stack: PanelStack, depth_m: tuple[float,
 
 
 def sharpened(depth: F32) -> F32:
-    """Sharpen a depth map: pixels in blurred edges get the near or the far side's depth, whichever is closer."""
+    """Sharpen a depth map: pixels in blurred edges get the near or the far depth, as is closer."""
     kernel = np.ones((BLURRED_PX, BLURRED_PX), np.uint8)
     high, low = cv2.dilate(depth, kernel), cv2.erode(depth, kernel)
     snapped = np.where(high - depth < depth - low, high, low)
@@ -92,8 +92,8 @@ def sharpened(depth: F32) -> F32:
 
 
 def unmixed(colour: U8, depth: F32) -> U8:
-    """Replace colours next to depth edges, which may mix both sides, by those of pixels farther from the edge on each
-    side.
+    """Replace colours next to depth edges, which may mix both sides, by those of pixels farther from the
+    edge on each side.
     """
     side = 2 * MIXED_PX + 1
     kernel = np.ones((side, side), np.uint8)
@@ -113,8 +113,8 @@ def unmixed(colour: U8, depth: F32) -> U8:
 
 
 def background(depth: F32, colour: U8) -> tuple[F32, U8, Mask]:
-    """Invent the background behind depth edges: its depth, its colour, and the mask (h, w) of its pixels. The far side
-    is continued behind the near side. The mask also includes a band of the far side, to close gaps.
+    """Invent the background behind depth edges: its depth, its colour, and the mask (h, w) of its pixels.
+    The far side is continued behind the near side. The mask also includes a band of the far side, to close gaps.
     """
     far_side = depth < cv2.dilate(depth, np.ones((5, 5), np.uint8)) - TORN_RELATIVE
     if not far_side.any():
@@ -175,8 +175,8 @@ def _edge_to_edge(index: Any, count: int) -> F64:
 
 
 def prepare(file: SceneFile) -> Callable[..., TriangleSource]:
-    """Read a picture with depth, and return a function that creates the source in a GL context. Raises InputError if
-    the picture cannot be read or its right half is not a depth map.
+    """Read a picture with depth, and return a function that creates the source in a GL context. Raises
+    InputError if the picture cannot be read or its right half is not a depth map.
     """
     colour, depth = split_rgbd(open_frames(file.path, file.settings).frame(0), file.path)
     # A split surface also has edges inside its outline, so it needs multisampling instead of ramps.

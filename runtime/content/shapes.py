@@ -67,9 +67,9 @@ def welded(positions_m: F32) -> NDArray[np.int64]:
 
 
 def solid_winding(shape: Shape) -> int:
-    """Return the winding of a solid shape's triangles, 1 (counter-clockwise from outside) or -1, or 0 if it is not
-    solid. The triangles of a solid shape enclose volumes and have the same winding everywhere, so its back faces are
-    always hidden. Vertices at the same position are treated as one, and connected triangles as one body.
+    """Return the winding of a solid shape's triangles, 1 (counter-clockwise from outside) or -1, or 0 if
+    it is not solid. The triangles of a solid shape enclose volumes and have the same winding everywhere, so its back
+    faces are always hidden. Vertices at the same position are treated as one, and connected triangles as one body.
     """
     corners = welded(shape.positions_m)[shape.triangles]
     real = (np.diff(np.sort(corners, axis=1), axis=1) > 0).all(1)  # a sphere has zero-area triangles at its poles
@@ -106,7 +106,7 @@ def flat_normals(corners: ArrayLike) -> F32:
 
 
 class Origin:
-    """Point subtracted from a file's coordinates before they become float32: zero unless they would lose detail."""
+    """Point subtracted from a file's coordinates before they become float32: usually zero."""
 
     def __init__(self) -> None:
         self.point: F64 | None = None  # (3,) in the file's coordinates; None before the first positions
@@ -122,8 +122,8 @@ class Origin:
 
 
 def placed(positions: ArrayLike, normals: ArrayLike | None, matrices: F64, *, origin: Origin) -> tuple[F32, F32 | None]:
-    """Transform positions and normals (v, 3) or None by one affine matrix (4, 4), or one per vertex (v, 4, 4), and
-    subtract `origin`. Normals remain unit vectors.
+    """Transform positions and normals (v, 3) or None by one affine matrix (4, 4), or one per vertex (v,
+    4, 4), and subtract `origin`. Normals remain unit vectors.
     """
     positions = np.asarray(positions)
     moved = np.empty(positions.shape, np.float32)
@@ -170,8 +170,8 @@ def _shape(positions: F64, normals: F64, uv: F64, triangles: I32) -> Shape:
 
 
 def card(width_m: float, height_m: float, *, repeat: tuple[float, float] = (1.0, 1.0)) -> Shape:
-    """Return a rectangle, width along y and height along z, in x = 0. From +x, its repeated texture is upright and
-    unmirrored.
+    """Return a rectangle, width along y and height along z, in x = 0. From +x, its repeated texture is
+    upright and unmirrored.
     """
     s, t, triangles = _grid(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
     positions = np.column_stack([0 * s, (s - 0.5) * width_m, (0.5 - t) * height_m])
@@ -203,8 +203,8 @@ def sphere(radius_m: float, *, columns: int = 48, rows: int = 24) -> Shape:
 
 
 def torus(radius_m: float, tube_m: float, *, columns: int = 64, rows: int = 24) -> Shape:
-    """Return a torus around the x axis; `radius_m` is from its centre to the tube's, `columns` are segments around the
-    axis.
+    """Return a torus around the x axis; `radius_m` is from its centre to the tube's, `columns` are
+    segments around the axis.
     """
     s, t, triangles = _grid(np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1))
     around, across = s * 2 * np.pi, t * 2 * np.pi
@@ -219,8 +219,8 @@ def _runs(marks: str) -> list[tuple[int, int]]:
 
 
 def lettering(text: str, *, cell_m: float, depth_m: float) -> Shape:
-    """Return text of `GLYPHS` in solid letters of 5 x 7 cells, one cell apart, centred on the origin and readable from
-    +x.
+    """Return text of `GLYPHS` in solid letters of 5 x 7 cells, one cell apart, centred on the origin and
+    readable from +x.
     """
     left = -(len(text) * 6 - 1) / 2
     bars = []

@@ -58,8 +58,8 @@ void main() {
 
 
 def prepare(file: SceneFile) -> Callable[..., SplatSource]:
-    """Read a splat file, and return a function that creates the source in a GL context. Raises InputError if the file
-    cannot be read or contains no visible splats.
+    """Read a splat file, and return a function that creates the source in a GL context. Raises InputError
+    if the file cannot be read or contains no visible splats.
     """
     suffix = file.path.suffix.lower()
     if suffix == ".ply":

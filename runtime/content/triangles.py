@@ -127,7 +127,7 @@ void main() {
 
 
 class DrawnPart:
-    """Part prepared for drawing, on any thread and without a GL context. After `upload`, it also owns GL objects."""
+    """Part prepared without a GL context, on any thread. After `upload`, it also owns GL objects."""
 
     def __init__(self, part: Part, *, outlined: bool = True) -> None:
         """Prepare a part, with edges for smooth outlines if `outlined` and neither translucent nor large."""
@@ -170,7 +170,7 @@ class DrawnPart:
         return look.front_face if self._solid_winding > 0 else {"cw": "ccw", "ccw": "cw"}[look.front_face]
 
     def upload(self, context: Any, surface_program: Any, outline: Any, textures: list[Any]) -> None:
-        """Create the part's GL objects; the source owns the program, the outlines' vertex array, and the textures."""
+        """Create the part's GL objects; the source owns program, outlines' vertex array and textures."""
         self.surface_program, self.outline, self.textures = surface_program, outline, textures
         self._buffer, self._triangles = (_uploaded(context, array) for array in (self.vertices, self.triangles))
         if self.edges is None and not self.is_projected:  # this may free hundreds of MiB
@@ -179,7 +179,7 @@ class DrawnPart:
         self.surface = context.vertex_array(surface_program, [layout], index_buffer=self._triangles)
 
     def draw_surface(self) -> None:
-        """Draw the part's triangles, in several calls if large: a software rasteriser holds Python's lock in each."""
+        """Draw the triangles, in several calls: a software rasteriser holds Python's lock in each."""
         for first in range(0, self.corner_count, 3 * DRAWN_AT_ONCE):
             self.surface.render(first=first, vertices=min(3 * DRAWN_AT_ONCE, self.corner_count - first))
 

@@ -84,8 +84,8 @@ def _source(options: WindowOptions, file: SceneFile, context: Any = None) -> Con
 
 
 def place_of(title: str, listed: str) -> Place | None:
-    """Return the place of the largest window, but our panels, whose title or class contains a text, in any case, or
-    None. `listed` is what `xwininfo -root -tree` prints.
+    """Return the place of the largest window, but our panels, whose title or class contains a text, in
+    any case, or None. `listed` is what `xwininfo -root -tree` prints.
     """
     found = []
     for line in listed.splitlines():

@@ -27,7 +27,7 @@ PAPER = 246  # background grey level
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """A measured refresh from a run, with aligned layers for the contact sheet and the solution for the viewer page."""
+    """A measured refresh, with aligned layers for the contact sheet and the solution for the viewer."""
 
     layers: U8  # (N, h, w, 3 or 4) layers as shown by the panels, after alignment
     eye_views: EyeViews
@@ -42,8 +42,8 @@ class Moment:
 
 
 def contact_sheet(layers: U8, eye_views: EyeViews | None, *, headline: str, lines: Sequence[str] = ()) -> U8:
-    """Draw a contact sheet (h, w, 3): a row of layers, then for each eye, if given, target, retina image and error.
-    Long lines of text are wrapped.
+    """Draw a contact sheet (h, w, 3): a row of layers, then for each eye, if given, target, retina image
+    and error. Long lines of text are wrapped.
     """
     height, width = layers.shape[1:3]
     tile = (TILE_WIDTH, round(TILE_WIDTH * height / width))
@@ -82,7 +82,7 @@ def contact_sheet(layers: U8, eye_views: EyeViews | None, *, headline: str, line
 
 
 def headline(light_db: float | None) -> str:
-    """Return a headline with the light PSNR for a tracking error of 1 mm, None or NaN if it was not measured."""
+    """Return a headline with the light PSNR for a tracking error of 1 mm, None or NaN if unknown."""
     if light_db is None or math.isnan(light_db):
         return "light PSNR at these eyes was not measured"
     conditions = f"pixels as squares, pupil {PUPIL_MM:g} mm, tracking error {TRACKING_SIGMA_MM:g} mm"

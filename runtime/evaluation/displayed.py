@@ -37,8 +37,8 @@ class EyeViews:
     fov_deg: float  # horizontal field of view of the images and targets
 
     def viewer(self, layers: U8, text: Sequence[str], *, relief: F32 | None = None) -> str:
-        """Return an HTML viewer page of the first viewer's views, for layers solved for `eyes_m`, and their relief (h,
-        w).
+        """Return an HTML viewer page of the first viewer's views, for layers solved for `eyes_m`, and their
+        relief (h, w).
         """
         shown = [0, min(1, len(self.wanted) - 1)]  # the page shows the first viewer's eyes
         wanted, eyes_m = [as_codes(intensities(self.wanted[n])) for n in shown], np.asarray(self.eyes_m)[shown]
@@ -89,7 +89,7 @@ class Expected(NamedTuple):
 def expected_quality(
     eye_views: EyeViews, layers: U8, *, sampling: Sampling | None = None, sigmas_mm: Sequence[float] = SIGMAS_MM
 ) -> Expected:
-    """Measure the expected quality of layers for several tracking errors, by default light (`expected_errors`)."""
+    """Measure the expected quality of layers for tracking errors, by default light."""
     groups = sampling.groups if sampling else 0
     errors = dict.fromkeys(sigmas_mm, np.full(1 + groups, np.nan))
     with contextlib.suppress(ValueError):
@@ -108,8 +108,9 @@ def expected_quality(
 
 
 def on_panels_raster(picture: Picture, stack: PanelStack) -> Picture:
-    """Resample a picture to the panels' resolution. A picture with a different aspect ratio keeps it, and is reduced if
-    it has more pixels than a panel. Panels cannot show finer detail, and measuring it would cost time and memory.
+    """Resample a picture to the panels' resolution. A picture with a different aspect ratio keeps it, and
+    is reduced if it has more pixels than a panel. Panels cannot show finer detail, and measuring it would cost time and
+    memory.
     """
     height_px, width_px = picture.shape[:2]
     size = (stack.width_px, stack.height_px)

@@ -34,8 +34,8 @@ def write_motion(
     rate_hz: float = RATE_HZ,
     noise_mm: float = NOISE_MM,
 ) -> dict[str, Any]:
-    """Write a recording of a motion, and return a description of it. Seed 0 selects the benchmark's path and noise.
-    Raises InputError if the motion is unknown, the length is out of range, or the file cannot be written.
+    """Write a recording of a motion, and return a description of it. Seed 0 selects the benchmark's path
+    and noise. Raises InputError if the motion is unknown, the length is out of range, or the file cannot be written.
     """
     if motion not in (*MOTIONS, *MOTIONS_OF_TWO):
         known = ", ".join((*MOTIONS, *MOTIONS_OF_TWO))

@@ -53,7 +53,7 @@ def view_error_mm(eyes_m: Eyes, solved_for_m: Eyes) -> float:
 
 
 def live_error(layers: U8, targets: Pictures, stack: PanelStack, *, eyes_m: Eyes, fov_deg: float) -> float:
-    """Return the mean squared error of the light at two eyes. Raises ValueError if they see no part of the panels."""
+    """Return the mean squared error of the light at two eyes. Raises ValueError if they see nothing."""
     pictures = [intensities(picture) for picture in targets]
     sampling = LIVE_LARGE if pictures[0].size > PLENTY else LIVE
     errors = squared_errors(
@@ -71,9 +71,9 @@ def measure_refresh(
     *,
     quick: bool = False,
 ) -> RefreshQuality:
-    """Measure a refresh's quality for all targets that were drawn, unless the eyes see no part of the panels. `carried`
-    are the layers aligned as if all content were on the middle panel, and those before alignment; None if more than a
-    solution was shown. `quick` measures only the light at the aligned eyes, on fewer pixels.
+    """Measure a refresh's quality for all targets that were drawn, unless the eyes see no part of the
+    panels. `carried` are the layers aligned as if all content were on the middle panel, and those before alignment;
+    None if more than a solution was shown. `quick` measures only the light at the aligned eyes, on fewer pixels.
     """
     error = None
     if targets.true is not None and account.true_eyes_m is not None:

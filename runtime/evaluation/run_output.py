@@ -97,7 +97,7 @@ class RunOutput:
     def light_targets(
         self, frame: int, *, info: Mapping[str, Any], drawn: Pictures | None, true: Pictures | None
     ) -> None:
-        """Queue light.json and target pictures, not to be modified afterwards, for the folder `light/<frame>/`."""
+        """Queue light.json and target pictures, not to be modified afterwards, for `light/<frame>/`."""
 
         def write() -> None:
             for name, pictures in (("drawn", drawn), ("true", true)):
@@ -119,8 +119,8 @@ class RunOutput:
     def finish(
         self, summary: dict[str, Any], layers: U8 | None, moment: Moment | None = None, *, unseen: str = ""
     ) -> None:
-        """Queue the files at the end of a run, or only summary.json after a disk failure or without layers. The contact
-        sheet and the eyes' views show `moment`. Without it, the viewer page is `unseen`.
+        """Queue the files at the end of a run, or only summary.json after a disk failure or without layers.
+        The contact sheet and the eyes' views show `moment`. Without it, the viewer page is `unseen`.
         """
 
         def write() -> None:

@@ -23,9 +23,9 @@ WHOLE_PX = 1920 * 1200  # light is measured at every pixel of a picture that has
 
 @dataclass(frozen=True, slots=True)
 class PairQuality:
-    """Quality of layers at the eyes they were solved for (docs/contracts.md, Error). Mappings are keyed by tracking
-    error in mm: "0", "1", "2". A value is NaN if the tracking error moves an eye so far that it sees no part of the
-    panels. SSIM is NaN if it was not requested.
+    """Quality of layers at the eyes they were solved for (docs/contracts.md, Error). Mappings are keyed
+    by tracking error in mm: "0", "1", "2". A value is NaN if the tracking error moves an eye so far that it sees no
+    part of the panels. SSIM is NaN if it was not requested.
     """
 
     light_db: BySigma  # with square pixels and a finite pupil; quote "1", a good tracker's tracking error
@@ -48,8 +48,8 @@ class PairQuality:
 
 @dataclass(frozen=True)
 class SolvedPair:
-    """Layers for several eyes' pictures. The retina images and the quality are computed on first access. On first
-    access, ValueError is raised if an eye is behind a panel or sees no part of the panels.
+    """Layers for several eyes' pictures. The retina images and the quality are computed on first access.
+    On first access, ValueError is raised if an eye is behind a panel or sees no part of the panels.
     """
 
     layers: U8  # (N, h, w, 3 or 4) layers from rear to front
@@ -71,8 +71,8 @@ class SolvedPair:
         return self._measured(self.eye_views, sigmas_mm=SIGMAS_MM, every=every)
 
     def sampled(self, *, sigmas_mm: Sequence[float], every: int) -> PairQuality:
-        """Measure quality, without SSIM, of every `every`-th pixel and row, with light's standard error unless all
-        count.
+        """Measure quality, without SSIM, of every `every`-th pixel and row, with light's standard error
+        unless all count.
         """
         views = displayed(
             self.layers, self.pictures, self.stack, eyes_m=self.eyes_m, fov_deg=self.fov_deg, similarity=False

@@ -30,8 +30,8 @@ class Timed(Generic[T]):
 def timed(
     call: Callable[[], T], *, runs: int, most: int | None = None, enough_s: float = 0.0, slow_s: float = float("inf")
 ) -> Timed[T]:
-    """Time repeated runs of a call, after a warm-up, which counts and is the only run if it takes `slow_s`. After
-    `enough_s` of timed runs, no other is started.
+    """Time repeated runs of a call, after a warm-up, which counts and is the only run if it takes
+    `slow_s`. After `enough_s` of timed runs, no other is started.
     """
     answer, took_ms = _timed(call)
     if took_ms >= slow_s * 1e3:
@@ -44,8 +44,8 @@ def timed(
 
 
 def timed_in_turn(ways: Mapping[str, Callable[[], U8]], *, runs: int) -> dict[str, Timed[U8]]:
-    """Time calls by name in alternation, so that other load on the machine affects all of them alike. Their last
-    results are copied, because a call may reuse the buffer it returns.
+    """Time calls by name in alternation, so that other load on the machine affects all of them alike.
+    Their last results are copied, because a call may reuse the buffer it returns.
     """
     times: dict[str, list[float]] = {name: [] for name in ways}
     answers: dict[str, U8] = {}

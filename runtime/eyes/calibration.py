@@ -81,7 +81,7 @@ class Calibration:
         return float(np.cbrt(np.linalg.det(self.stack_from_sensor[:3, :3])))
 
     def points(self, sensor_m: ArrayLike) -> F64:
-        """Transform (..., 3) points, in metres, from the sensor frame to the stack frame (EyeReal supplement, (28))."""
+        """Transform (..., 3) points, in metres, from frame `sensor` to `stack` (EyeReal supplement, (28))."""
         points = np.asarray(sensor_m, dtype=np.float64)
         return points @ self.stack_from_sensor[:3, :3].T + self.stack_from_sensor[:3, 3]
 
@@ -95,8 +95,8 @@ class Calibration:
         )
 
     def position_error_m(self, stack_m: ArrayLike) -> F64 | None:
-        """Return the calibration's RMS error in metres at points (..., 3) in `stack`, or None if the file has no
-        covariance.
+        """Return the calibration's RMS error in metres at points (..., 3) in `stack`, or None if the file has
+        no covariance.
         """
         if self.file.covariance is None:
             return None
@@ -106,7 +106,7 @@ class Calibration:
         return error_m
 
     def serial_warning(self, serial: str) -> str:
-        """Return a one-line warning if a sensor, by its serial number or "", is not the calibrated one, or ""."""
+        """One-line warning if a sensor, by its serial number or "", is not the calibrated one, or ""."""
         calibrated = self.file.sensor_serial
         if not calibrated or serial == calibrated:
             return ""
@@ -115,7 +115,7 @@ class Calibration:
 
 
 def position_jacobian(stack_m: ArrayLike, *, pivot_m: ArrayLike) -> F64:
-    """Return the (..., 3, 7) derivatives of points (..., 3) in `stack` with respect to the seven parameters."""
+    """Derivatives (..., 3, 7) of points (..., 3) in `stack` with respect to the seven parameters."""
     arm = np.asarray(stack_m, dtype=np.float64) - np.asarray(pivot_m, dtype=np.float64)
     jacobian = np.zeros((*arm.shape, 7))
     jacobian[..., 0, 1], jacobian[..., 0, 2] = arm[..., 2], -arm[..., 1]
@@ -127,8 +127,8 @@ def position_jacobian(stack_m: ArrayLike, *, pivot_m: ArrayLike) -> F64:
 
 
 def similarity_defect(matrix: ArrayLike) -> float:
-    """Return max |A^T A / s² - I| of the upper left 3x3 block A with scale s: infinite if it is zero. It is 0 for an
-    exact similarity, even one that includes a reflection.
+    """Return max |A^T A / s² - I| of the upper left 3x3 block A with scale s: infinite if it is zero. It
+    is 0 for an exact similarity, even one that includes a reflection.
     """
     linear = np.asarray(matrix, dtype=np.float64)[:3, :3]
     largest = float(np.abs(linear).max())
@@ -139,9 +139,9 @@ def similarity_defect(matrix: ArrayLike) -> float:
 
 
 def check_similarity(matrix: F64, *, source: str | Path) -> None:
-    """Check that a 4x4 matrix is a plausible calibration. Raises InputError, which names the `source` and the field, if
-    it has an entry beyond `MOST` or a wrong last row, is not a similarity, mirrors space, has a scale outside `SCALE`
-    or places the sensor beyond `MAX_DISTANCE_M`.
+    """Check that a 4x4 matrix is a plausible calibration. Raises InputError, which names the `source` and
+    the field, if it has an entry beyond `MOST` or a wrong last row, is not a similarity, mirrors space, has a scale
+    outside `SCALE` or places the sensor beyond `MAX_DISTANCE_M`.
     """
     name = "stack_from_sensor"
     if not np.abs(matrix).max() <= MOST:
@@ -191,9 +191,9 @@ def _warnings(matrix: F64, source: str) -> tuple[str, ...]:
 
 
 def load_calibration(path: Path | None) -> Calibration:
-    """Load and check a calibration file, or the demo recording's. A scale far from 1, or a sensor more than `NEAR_M`
-    away, only adds a line to `Calibration.warnings`. Raises InputError, which names file and field, if it is missing,
-    malformed, or fails `check_similarity`.
+    """Load and check a calibration file, or the demo recording's. A scale far from 1, or a sensor more
+    than `NEAR_M` away, only adds a line to `Calibration.warnings`. Raises InputError, which names file and field, if it
+    is missing, malformed, or fails `check_similarity`.
     """
     file = DEMO_FILE if path is None else path
     table = read_table(file)

@@ -75,8 +75,8 @@ class EyeFinder:
         return [follower.pupils for follower in self._others if follower.pupils is not None]
 
     def find(self, frame: SensorFrame) -> EyePoints | None:
-        """Return the viewer's eyes in the sensor frame, or return None and store the cause in `reason`. The sample
-        needs colour and intrinsics; depth, if any, must be registered to colour.
+        """Return the viewer's eyes in the sensor frame, or return None and store the cause in `reason`. The
+        sample needs colour and intrinsics; depth, if any, must be registered to colour.
         """
         return self._first.find(frame, taken=self._faces_except(self._first))
 
@@ -164,9 +164,9 @@ def _eye_points(pupils: Pupils, depths: EyeDepths, intrinsics: Intrinsics) -> Ey
 
 
 def covariance(point: F64, line: F64, sideways_m: float, up_m: float, along_m: float) -> F64:
-    """Return the (3, 3) covariance, in m², of the position of a point (3,) seen from the origin. The standard
-    deviations are along the part of `line` (3,) perpendicular to the line of sight, perpendicular to both, and along
-    the line of sight.
+    """Return the (3, 3) covariance, in m², of the position of a point (3,) seen from the origin. The
+    standard deviations are along the part of `line` (3,) perpendicular to the line of sight, perpendicular to both, and
+    along the line of sight.
     """
     sight = point / np.linalg.norm(point)
     sideways = line - (line @ sight) * sight

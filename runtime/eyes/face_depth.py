@@ -55,8 +55,8 @@ class FaceDepth:
         self.has_measured = False
 
     def at(self, pupils: Pupils, depth_mm: U16 | None, intrinsics: Intrinsics, depth_from_colour: F64) -> EyeDepths:
-        """Estimate both eyes' distances from the camera in one colour picture with `intrinsics`. `depth_mm` (h, w) is 0
-        where not measured. `depth_from_colour` (2,) are depth pixels per colour pixel.
+        """Estimate both eyes' distances from the camera in one colour picture with `intrinsics`. `depth_mm`
+        (h, w) is 0 where not measured. `depth_from_colour` (2,) are depth pixels per colour pixel.
         """
         relief = pupils.mesh_px[:, 2]
         eyes = np.array([relief[list(corners)].mean() for corners in CORNERS])

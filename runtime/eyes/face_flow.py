@@ -44,8 +44,8 @@ class FaceFlow:
         self._grey, self._mesh = self._crop(picture), mesh[RIGID, :2].copy()
 
     def moved(self, picture: U8, mesh: F64) -> F64 | None:
-        """Return the (2, 3) similarity from the remembered picture's pixels to a new one's, with its mesh (468, 3).
-        None if too few points can be tracked or fit a similarity.
+        """Return the (2, 3) similarity from the remembered picture's pixels to a new one's, with its mesh
+        (468, 3). None if too few points can be tracked or fit a similarity.
         """
         grey = self._crop(picture)
         matrix = self._crop_from_picture

@@ -45,8 +45,8 @@ class Models(NamedTuple):
 
     @classmethod
     def of(cls, *accelerations: Sequence[float], stay_s: float) -> Models:
-        """Stack the models of quantities, each with its models' deviations of acceleration along each axis, in m/s².
-        `stay_s` is the mean time that a model applies before the motion switches to another.
+        """Stack the models of quantities, each with its models' deviations of acceleration along each axis,
+        in m/s². `stay_s` is the mean time that a model applies before the motion switches to another.
         """
         counts = [len(models) for models in accelerations]
         quantity = np.repeat(np.arange(len(counts)), counts)
@@ -131,8 +131,8 @@ def _outlook(dt_s: float) -> tuple[F64, F64]:
 
 
 def started(places: F64, *, noise: F64, speeds: Sequence[float], models: Models) -> Belief:
-    """Return the belief after first positions (quantities, 3), each with covariance `noise`, and a mean velocity of
-    zero. `speeds` are the standard deviations of each quantity's velocity along each axis, in m/s.
+    """Return the belief after first positions (quantities, 3), each with covariance `noise`, and a mean
+    velocity of zero. `speeds` are the standard deviations of each quantity's velocity along each axis, in m/s.
     """
     count = len(models.quantity)
     state, covariance = np.zeros((count, 9)), np.zeros((count, 9, 9))
@@ -144,7 +144,7 @@ def started(places: F64, *, noise: F64, speeds: Sequence[float], models: Models)
 
 
 def predicted(belief: Belief, dt_s: float, *, models: Models) -> Belief:
-    """Return the belief after a time step of 0 to `LONGEST_S`: the models are first mixed, then propagated."""
+    """Return the belief after a step of 0 to `LONGEST_S`: models are first mixed, then propagated."""
     change = models.switched + math.exp(-dt_s / models.stay_s) * models.unswitched
     weight = change @ belief.weight
     shares = change * belief.weight / weight[:, None]  # (into, from)
@@ -158,7 +158,8 @@ def predicted(belief: Belief, dt_s: float, *, models: Models) -> Belief:
 
 
 def innovation(belief: Belief, measured: F64, *, noise: F64, models: Models) -> Innovation:
-    """Compare measured positions (quantities, 3), each with covariance `noise`, with each model's prediction.
+    """Compare measured positions (quantities, 3), each with covariance `noise`, with each model's
+    prediction.
 
     The joint covariance of measurement and state has a Cholesky factor with three parts: the measurement's factor, the
     gain times this factor, and the factor of the corrected state's covariance, which thus stays positive definite. One
@@ -187,8 +188,8 @@ def _cholesky(covariance: F64) -> F64:
 
 
 def surprise(seen: Innovation, *, models: Models) -> float:
-    """Return the squared Mahalanobis distance from the most surprising quantity to its nearest model. It has a chi²
-    distribution with three degrees of freedom for a good measurement and the right model.
+    """Return the squared Mahalanobis distance from the most surprising quantity to its nearest model. It
+    has a chi² distribution with three degrees of freedom for a good measurement and the right model.
     """
     return float(np.minimum.reduceat(seen.chi2, models.first).max())
 

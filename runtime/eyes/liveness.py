@@ -73,5 +73,5 @@ class Liveness:
             self._pictures.append(self._anchor)
 
     def is_picture(self, face: Sign, *, alike: float) -> bool:
-        """Return True if a face is where a picture was found, correlates with it by `alike`, and has not moved."""
+        """Return True if a face is where a picture was found, correlates by `alike`, and has not moved."""
         return any(face.apart(one) < STILL and face.looks @ one.looks > alike for one in self._pictures)

@@ -31,7 +31,7 @@ Motion = Callable[[F64], tuple[F64, F64]]
 
 
 def minimum_jerk(times_s: F64, *, knots_s: F64, values: F64) -> F64:
-    """Interpolate values (k, ...) at stops by minimum-jerk movements (Flash and Hogan 1985) at times (n,)."""
+    """Interpolate values (k, ...) by minimum-jerk movements (Flash and Hogan 1985) at times (n,)."""
     index = np.clip(np.searchsorted(knots_s, times_s, side="right") - 1, 0, len(knots_s) - 2)
     s = np.clip((times_s - knots_s[index]) / (knots_s[index + 1] - knots_s[index]), 0, 1)
     blend = s**3 * (10 + s * (6 * s - 15))
@@ -143,8 +143,8 @@ def observe(
     seed: int = 1,
     path: Path = BENCHMARK_PATH,
 ) -> list[Observation]:
-    """Simulate the samples that a sensor takes of one of `MOTIONS`, on a variation of its path. `noise_m` is the
-    deviation for each eye along each axis. A share of `outliers` have one or both eyes displaced by 4 to 20 cm.
+    """Simulate the samples that a sensor takes of one of `MOTIONS`, on a variation of its path. `noise_m`
+    is the deviation for each eye along each axis. A share of `outliers` have one or both eyes displaced by 4 to 20 cm.
     `dropout_every_s` is 0 for none.
     """
     random = np.random.default_rng([seed, *motion.encode(), round(rate_hz)])

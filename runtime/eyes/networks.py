@@ -117,8 +117,8 @@ class FaceNetwork:
         self._session = load_network("yunet.onnx")
 
     def find(self, picture: U8, *, longest_px: int, score_min: float) -> list[FoundFace]:
-        """Return the faces in an RGB picture, from the highest score down to `score_min`. If its longer side exceeds
-        `longest_px`, the picture is reduced to that before the search.
+        """Return the faces in an RGB picture, from the highest score down to `score_min`. If its longer side
+        exceeds `longest_px`, the picture is reduced to that before the search.
         """
         height, width = picture.shape[:2]
         scale = min(1.0, longest_px / max(height, width))
@@ -160,7 +160,7 @@ class MeshNetwork:
         self._session = load_network("face_mesh.onnx")
 
     def points(self, picture: U8, square: Square) -> tuple[F64, float]:
-        """Return the (468, 3) face points, in pixels with z away from the camera, and the probability of a face."""
+        """Return the (468, 3) face points, in pixels with z away from the camera, and a face's probability."""
         crop, matrix = square.crop(picture, self.SIZE)
         mesh, presence = self._session.run(None, {"input_1": crop})
         points = mesh.reshape(468, 3).astype(np.float64)
@@ -177,8 +177,8 @@ class IrisNetwork:
         self._session = load_network("iris.onnx")
 
     def points(self, picture: U8, square: Square, *, is_left: bool) -> tuple[F64, F64]:
-        """Return (5, 2) iris points, centre first, and (16, 2) points on the lower, then the upper lid, in pixels. The
-        input of the viewer's left eye is mirrored.
+        """Return (5, 2) iris points, centre first, and (16, 2) points on the lower, then the upper lid, in
+        pixels. The input of the viewer's left eye is mirrored.
         """
         crop, matrix = square.crop(picture, self.SIZE, mirrored=is_left)
         names = ["output_iris", "output_eyes_contours_and_brows"]

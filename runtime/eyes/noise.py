@@ -24,7 +24,7 @@ LEAST_M = 1e-4  # smallest standard deviation returned, because a head does not 
 
 
 class NoiseWatch:
-    """Measures the noise of the eye positions that a tracker accepts. Not thread-safe. Never reads a clock."""
+    """Measures the noise of the eye positions that a tracker accepts, by their times. Not thread-safe."""
 
     def __init__(self) -> None:
         self.sigma_m: F64 | None = None  # (3,) standard deviation of one eye along x, y and z; None: not yet known
@@ -33,7 +33,7 @@ class NoiseWatch:
         self._count = 0  # number of differences computed
 
     def add(self, head_m: F64, *, capture_ns: int) -> None:
-        """Update `sigma_m` by an accepted midpoint of the eyes and the vector from it to the right eye (2, 3)."""
+        """Update `sigma_m` by the eyes' midpoint and the vector from it to the right eye (2, 3)."""
         self._newest.append((capture_ns, head_m))
         if len(self._newest) < WINDOW or not 0 < capture_ns - self._newest[0][0] <= LONGEST_NS:
             return

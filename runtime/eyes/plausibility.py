@@ -40,9 +40,9 @@ _HINTS = {
 
 
 def reason_against(eyes_m: Eyes, *, in_front_m: float = 0.0) -> str:
-    """Return why two points cannot be a viewer's left and right eye, or an empty string if they can. The eyes count as
-    swapped if the vector from the left eye to the right eye points to the viewer's left. Both must have x >
-    `in_front_m`.
+    """Return why two points cannot be a viewer's left and right eye, or an empty string if they can. The
+    eyes count as swapped if the vector from the left eye to the right eye points to the viewer's left. Both must have x
+    > `in_front_m`.
     """
     (lx, ly, lz), (rx, ry, rz) = eyes_m.tolist()
     if not all(map(math.isfinite, (lx, ly, lz, rx, ry, rz))):
@@ -76,8 +76,8 @@ class RefusalWatch:
         return self._counts
 
     def update(self, reason: str) -> str:
-        """Count a sample, refused for a reason or accepted (""). Return a line to log if the warning has changed, or
-        "".
+        """Count a sample, refused for a reason or accepted (""). Return a line to log if the warning has
+        changed, or "".
         """
         self._last.append(reason if reason in MISTAKES else "")
         if reason:

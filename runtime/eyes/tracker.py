@@ -267,7 +267,7 @@ class Tracker:
             self._other = None
 
     def ahead(self, time_ns: int) -> EyesEstimate:
-        """Return the same estimate as `at`, for a time without a picture: later blends start as without this call."""
+        """Return the same estimate as `at`, for a time without a picture, so that no blend begins."""
         asked_ns = self._asked_ns
         estimate = self.at(time_ns)
         self._asked_ns = asked_ns

@@ -38,9 +38,10 @@ class Choice:
 
 
 def choose(wanted: Wanted, predictor: Predictor, context: Callable[[], Any]) -> Choice:
-    """Choose a backend for a loaded model, and log the reason. `auto` times both; without OpenGL, it is the processor.
-    `context` returns an OpenGL context current on this thread or raises MissingPart; it is called only if needed. If
-    `wanted` is `gl`, raises MissingPart without OpenGL, and InputError if a panel is too large for its driver.
+    """Choose a backend for a loaded model, and log the reason. `auto` times both; without OpenGL, it is
+    the processor. `context` returns an OpenGL context current on this thread or raises MissingPart; it is called only
+    if needed. If `wanted` is `gl`, raises MissingPart without OpenGL, and InputError if a panel is too large for its
+    driver.
     """
     if predictor.on_panels(predictor.stack) is None:
         choice = Choice(_cpu(), f"the only backend that supports {predictor.name}")
@@ -94,8 +95,8 @@ def _faster(predictor: Predictor, made: Callable[[], GlBackend]) -> Choice:
 
 
 def solution_ms(predictor: Predictor, stack: PanelStack, backend: SolverBackend, *, runs: int) -> float:
-    """Return the time taken by the fastest of `runs` solutions, in ms, after an untimed one that compiles and
-    allocates.
+    """Return the time taken by the fastest of `runs` solutions, in ms, after an untimed one that compiles
+    and allocates.
     """
     solver = predictor.on_panels(stack)
     assert solver is not None

@@ -72,19 +72,19 @@ class Predictor(ABC):
         return None
 
     def set_backend(self, backend: SolverBackend) -> None:  # noqa: B027 - most have one
-        """Select what runs everything except the network from the next call on. Only for the thread that solves."""
+        """Select what runs everything except the network from now on. Only for the thread that solves."""
 
     def write_to(self, slots: LayerSlots) -> None:  # noqa: B027 - the layers of the others are copied
         """Write solutions to memory shared with another process, if the model can."""
 
     @abstractmethod
     def solve(self, job: Job, watch: Stopwatch | None = None) -> Prediction:
-        """Compute the layers for a job, and add each stage's time to `watch`. Raises ModelFailure if inference failed
-        or is not finite, and EyesNotServed for unsupported eye positions.
+        """Compute the layers for a job, and add each stage's time to `watch`. Raises ModelFailure if
+        inference failed or is not finite, and EyesNotServed for unsupported eye positions.
         """
 
     def warm_up(self, eyes_m: Eyes) -> None:
-        """Solve grey pictures in one step on every raster, to allocate memory; stage times are kept in `warmed_ms`."""
+        """Solve grey pictures in one step on every raster, to allocate memory, and set `warmed_ms`."""
         measured = {}
         for reduction in self.reductions:
             job = replace(grey_job(eyes_m, self.stack.reduced(reduction)), steps=1)

@@ -45,8 +45,8 @@ Columns = NDArray[np.floating[Any]]
 
 @dataclass(frozen=True, slots=True)
 class ColumnLaw:
-    """Columns u as t = middle + (1 - exp(-bend·(u - middle)))/bend, the homographies' coordinate; t = u if the bend is
-    0.
+    """Columns u as t = middle + (1 - exp(-bend·(u - middle)))/bend, the homographies' coordinate; t = u
+    if the bend is 0.
     """
 
     bend: float = 0.0  # per column
@@ -75,8 +75,8 @@ BEYOND_F = 1e-9  # lower limit for the logarithm's argument
 
 @dataclass(frozen=True, slots=True)
 class ChainFrame:
-    """Raster on the plane where the two outer panels have equal and opposite parallaxes. The homographies apply to
-    points (t, v, 1), where v is the row, and `columns` converts the column u to t.
+    """Raster on the plane where the two outer panels have equal and opposite parallaxes. The homographies
+    apply to points (t, v, 1), where v is the row, and `columns` converts the column u to t.
     """
 
     x_m: float  # the plane's x coordinate in frame `stack`
@@ -102,7 +102,8 @@ class ChainFrame:
         return np.asarray(inverse / inverse[2, 2], np.float64)
 
     def eye_sigma_px(self, stack: PanelStack, *, eye_sigma_m: float, cell_px: int) -> F32:
-        """Return the three lengths (3,) that the network needs as input, given the tracking error's standard deviation.
+        """Return the three lengths (3,) that the network needs as input, given the tracking error's standard
+        deviation.
 
         The first two are how far this error moves the outer panels' pictures, along and across the rows. The third is
         the centre panel's parallax relative to the raster's plane, along the rows. Lengths along the rows are in units
@@ -122,7 +123,8 @@ class ChainFrame:
 
 
 def chain_frame(eyes_m: Eyes, stack: PanelStack, *, most_cell_px: int, reduction: int) -> ChainFrame:
-    """Return the raster for a pair of eyes, with rows of `reduction` panel rows, sheared along the line of the eyes.
+    """Return the raster for a pair of eyes, with rows of `reduction` panel rows, sheared along the line
+    of the eyes.
 
     It covers the part of the panels that the eyes see through all of them, plus a margin. The outer panels' parallax is
     the smallest whole number of columns that makes a column at most `WIDEST` wide, but at most `most_cell_px` (K). If
@@ -249,7 +251,8 @@ def _window_of(middle: F64, stack: PanelStack, *, plane_m: float) -> _Window:
 
 @lru_cache(maxsize=8)
 def chain_modes(cells: int) -> tuple[F32, F32, F32, F32]:
-    """Return V, Ũ (cells + 1, cells + 1), s (cells + 1,) and U^T (cells + 1, cells): the chain operators' modes.
+    """Return V, Ũ (cells + 1, cells + 1), s (cells + 1,) and U^T (cells + 1, cells): the chain operators'
+    modes.
 
     The (cells, cells + 1) difference operator A, with rows [.. -2 2 ..], is U·diag(s)·V^T. The mean operator B, with
     rows [.. 1/2 1/2 ..], is U·diag(cos)·Ũ^T, where cos = sqrt(1 - s²/16). The modes are known in closed form: they are
@@ -269,8 +272,8 @@ def chain_modes(cells: int) -> tuple[F32, F32, F32, F32]:
 
 @lru_cache(maxsize=8)
 def cell_waves(cell_px: int) -> tuple[F32, F32]:
-    """Return an orthonormal real Fourier basis (2K, 2K) of a cell's columns, a wave per row, and its (2K,) frequencies.
-    Frequencies are in radians per parallax, that is, per `cell_px` (K) columns.
+    """Return an orthonormal real Fourier basis (2K, 2K) of a cell's columns, a wave per row, and its
+    (2K,) frequencies. Frequencies are in radians per parallax, that is, per `cell_px` (K) columns.
     """
     size = 2 * cell_px
     at = np.arange(size)

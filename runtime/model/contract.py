@@ -91,8 +91,8 @@ class Contract(Section):
 
 
 def parse_contract(metadata: dict[str, str], *, source: str | Path) -> Contract:
-    """Return the contract in an ONNX file's metadata. Raises InputError if it is missing, invalid or of another
-    version.
+    """Return the contract in an ONNX file's metadata. Raises InputError if it is missing, invalid or of
+    another version.
     """
     text = metadata.get(METADATA_KEY)
     if text is None:

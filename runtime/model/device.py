@@ -17,9 +17,9 @@ class SolverState(Protocol):
     """One stack's panels on one device, kept between frames. A state may be used by only one thread."""
 
     def begin(self, job: Job, geometry: Geometry, *, resumed: bool = False) -> AbstractContextManager[None]:
-        """Load a job's targets, for all other methods to be called within the returned context. Until a panel is set,
-        all pixels in its box have the rest value. If `resumed`, the panels and the momentum of the previous solution
-        are kept, which must have had the same geometry.
+        """Load a job's targets, for all other methods to be called within the returned context. Until a panel
+        is set, all pixels in its box have the rest value. If `resumed`, the panels and the momentum of the previous
+        solution are kept, which must have had the same geometry.
         """
 
     def set_panel(self, panel: int, codes: I16) -> None:
@@ -38,8 +38,9 @@ class SolverState(Protocol):
         """Update all panels once (docs/mathematics.md, L5)."""
 
     def write(self, buffer: LayerBuffer, outside: int | tuple[int, ...] | None) -> None:
-        """Write all panels to a buffer as 8-bit codes. If `outside` is None, it keeps its contents outside the boxes.
-        Otherwise, `outside` is a middle-panel code, or a colour that the eyes should see there; the outer panels rest.
+        """Write all panels to a buffer as 8-bit codes. If `outside` is None, it keeps its contents outside
+        the boxes. Otherwise, `outside` is a middle-panel code, or a colour that the eyes should see there; the outer
+        panels rest.
         """
 
     def close(self) -> None:

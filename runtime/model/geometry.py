@@ -58,7 +58,7 @@ class TargetView:
 
 
 class RaySets(NamedTuple):
-    """The ray sets of one step, which take turns: row k of a set's rays with turn t is picture row `turns`·k + t."""
+    """The ray sets of one step: row k of the rays of a set with turn t is picture row `turns`·k + t."""
 
     panels_from_rays: F64  # (E, N, 3, 3) homographies from a set's rays to pixels in the panels' boxes
     views: tuple[int, ...]  # (E,) each set's view
@@ -85,7 +85,7 @@ class Geometry:
 
     @property
     def missing_weight(self) -> float:
-        """Weight of rays that miss another panel's box when the middle panel is solved: full in a tapered window."""
+        """Weight of rays that miss another panel's box as the middle panel is solved: full in a taper."""
         return 1.0 if any(self.taper_px) else MISSING_WEIGHT
 
     def is_like(self, other: Geometry) -> bool:
@@ -103,9 +103,9 @@ class Geometry:
         return tuple(box.cut(self.stack.panel(n)) for n, box in enumerate(self.boxes))
 
     def ray_sets(self, places: Places, eye_sigma_m: float) -> RaySets:
-        """Return one step's ray sets: every view at 1 or 2 head positions, which take turns. If the views belong to
-        several points of each pupil, these take turns too, so that a step costs the same. The tracking error's
-        `eye_sigma_m` is limited so that all assumed eyes are in front of the panels.
+        """Return one step's ray sets: every view at 1 or 2 head positions, which take turns. If the views
+        belong to several points of each pupil, these take turns too, so that a step costs the same. The tracking
+        error's `eye_sigma_m` is limited so that all assumed eyes are in front of the panels.
         """
         eye_sigma_m = self._possible_m(eye_sigma_m)
         sure = self.rays.height_px == 1 or self._moved_px(eye_sigma_m) < KNOWN_PX
@@ -153,8 +153,8 @@ class Geometry:
         return float(eye_sigma_m * max(shares) / pitch_m)
 
     def tapers(self) -> tuple[F32, F32]:
-        """Return the rays' weights by column and by row: 1 inside a window, falling to 0 at edges that are not a
-        panel's.
+        """Return the rays' weights by column and by row: 1 inside a window, falling to 0 at edges that are
+        not a panel's.
         """
         box, kept, matrix = self.boxes[self.middle], self.kept, self.middle_from_rays.mean(axis=0)
         width_px, height_px = self.rays.width_px, self.rays.height_px
@@ -183,9 +183,10 @@ def geometry_of(
     taper_px: tuple[float, float] = (0.0, 0.0),
     points: int = 1,
 ) -> Geometry:
-    """Return the geometry for the rays that pass through a part of the middle panel, by default its box. `boxes` are
-    the pixels to solve on each panel, `taper_px` a window's taper, right and down, in middle-panel pixels, and `points`
-    the points of each pupil that have separate views. Raises ValueError if the views' pictures differ in size.
+    """Return the geometry for the rays that pass through a part of the middle panel, by default its box.
+    `boxes` are the pixels to solve on each panel, `taper_px` a window's taper, right and down, in middle-panel pixels,
+    and `points` the points of each pupil that have separate views. Raises ValueError if the views' pictures differ in
+    size.
     """
     box = boxes[stack.count // 2]
     kept = kept or box
@@ -224,8 +225,9 @@ def _looked_through(pictures_from_middle: F64, box: PixelRect, shape: tuple[int,
 
 
 def panel_from_middle(stack: PanelStack, rasters: Sequence[PlaneRaster], eye_m: F64, n: int) -> F64:
-    """Return the 3x3 homography, 1 in its last entry, from middle-panel pixels to panel `n`'s along an eye's rays. A
-    scale and a shift unless the panels are tilted (`optics.tilt`). Rasters may cover only a part of their panels.
+    """Return the 3x3 homography, 1 in its last entry, from middle-panel pixels to panel `n`'s along an
+    eye's rays. A scale and a shift unless the panels are tilted (`optics.tilt`). Rasters may cover only a part of their
+    panels.
     """
     target = rasters[n]
     matrix = rasters[stack.count // 2].to(target, eye_m)
@@ -235,8 +237,8 @@ def panel_from_middle(stack: PanelStack, rasters: Sequence[PlaneRaster], eye_m: 
 
 
 def visible_boxes(eyes_m: Eyes, stack: PanelStack) -> tuple[PixelRect, ...]:
-    """Return, for each panel, the padded box of pixels that an eye sees through all the other panels. If the eyes see
-    nothing through all panels, the boxes have the minimum size.
+    """Return, for each panel, the padded box of pixels that an eye sees through all the other panels. If
+    the eyes see nothing through all panels, the boxes have the minimum size.
     """
     planes, half = [Plane(x_m) for x_m in stack.x_m], np.array([stack.width_m, stack.height_m]) / 2
     middle = planes[stack.count // 2]
@@ -268,8 +270,8 @@ def _span(low: float, high: float, size: int) -> tuple[int, int]:
 
 
 def taper(at_px: F64, first: int, last: int, size: int, over_px: float) -> F32:
-    """Return weights that rise linearly from 0 at two limits to 1 within `over_px`, except at panel edges (0 and
-    `size`).
+    """Return weights that rise linearly from 0 at two limits to 1 within `over_px`, except at panel edges
+    (0 and `size`).
     """
     weights = np.ones(len(at_px))
     if over_px > 0 and first > 0:

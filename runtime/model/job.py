@@ -26,7 +26,7 @@ VIEWS_MOST = 8  # maximum number of views in a job
 
 @dataclass(frozen=True, slots=True)
 class SolveWindow:
-    """A window to solve on all panels. Outside, the outer panels rest, and the middle one shows what both eyes see."""
+    """A window to solve. Outside, the outer panels rest, and the middle one shows what both eyes see."""
 
     box: PixelRect  # pixels on every panel; if empty, nothing is solved
     kept: PixelRect  # pixels inside `box` to solve on the middle panel; the others show what both eyes see
@@ -139,7 +139,7 @@ class Job:
 def drawn_views(
     pictures: Sequence[U8 | DrawnPicture], stack: PanelStack, window: SolveWindow | None = None
 ) -> tuple[TargetView, ...]:
-    """Return the views for each eye's picture drawn on the pixels of the middle panel, or of a window of it."""
+    """Return the views for each eye's picture drawn on the middle panel's pixels, or a window of it."""
     raster = stack.panel(stack.count // 2)
     if window is not None:
         raster = window.box.cut(raster)

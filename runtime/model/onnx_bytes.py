@@ -24,8 +24,8 @@ DEEPEST = 32  # maximum nesting depth of graphs within graph attributes
 
 
 def fields(data: memoryview) -> Iterator[tuple[int, memoryview, memoryview]]:
-    """Yield the number, the value (empty for an integer 0) and the full bytes of each field in a message. Raises
-    ValueError if the bytes are not a message.
+    """Yield the number, the value (empty for an integer 0) and the full bytes of each field in a message.
+    Raises ValueError if the bytes are not a message.
     """
     at = 0
     while at < len(data):
@@ -60,8 +60,8 @@ def digest(data: bytes) -> str:
 
 
 def has_external_data(data: bytes) -> bool:
-    """Return True if a model stores a tensor in another file. Raises ValueError if it is malformed or nested too
-    deeply.
+    """Return True if a model stores a tensor in another file. Raises ValueError if it is malformed or
+    nested too deeply.
     """
     return _refers_to_a_file("model", memoryview(data), DEEPEST)
 

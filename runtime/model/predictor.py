@@ -19,7 +19,7 @@ SUMS = "SHA256SUMS"  # file with the shipped models' digests, in sha256sum forma
 
 
 def model_path(name: str) -> Path | None:
-    """Return a model's file, or None for `sart`. Raises InputError if `name` is neither known nor an ONNX file."""
+    """Return a model's file, or None for `sart`. Raises InputError for an unknown name or no ONNX file."""
     if name == "sart":
         return None
     if name in SHIPPED:
@@ -31,7 +31,7 @@ def model_path(name: str) -> Path | None:
 
 
 def shipped_sha256(name: str) -> str:
-    """Return the SHA-256 of a shipped model's file, "" for others. Raises InputError if a shipped one is not listed."""
+    """Return the SHA-256 of a shipped model's file, "" for others. Raises InputError if unlisted."""
     if name not in SHIPPED:
         return ""
     table = Path(str(resources.files("runtime.model") / "data" / SUMS))

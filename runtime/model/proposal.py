@@ -58,8 +58,8 @@ class Proposal(Protocol):
     session: ModelSession
 
     def panels(self, job: Job, geometry: Geometry, watch: Stopwatch) -> dict[int, I16]:
-        """Return the values (rows, columns[, 3]) proposed for panels' boxes, in sixteenths of a code; other panels
-        rest. Times are added to `watch` as "prepare" and "inference". Raises ModelFailure and EyesNotServed as
+        """Return the values (rows, columns[, 3]) proposed for panels' boxes, in sixteenths of a code; other
+        panels rest. Times are added to `watch` as "prepare" and "inference". Raises ModelFailure and EyesNotServed as
         `Predictor.solve`.
         """
 
@@ -163,8 +163,8 @@ class ChainProposal:
 
 
 def tapered(codes: I16, n: int, geometry: Geometry, *, middle_m: F64 | None = None) -> I16:
-    """Fade the values (rows, columns[, 3]) of an outer panel's box to the rest value at the edges of the window. The
-    window is projected from `middle_m`, by default the middle of the eyes.
+    """Fade the values (rows, columns[, 3]) of an outer panel's box to the rest value at the edges of the
+    window. The window is projected from `middle_m`, by default the middle of the eyes.
     """
     if max(geometry.taper_px) <= 0 or n == geometry.middle:
         return codes

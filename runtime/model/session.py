@@ -88,8 +88,8 @@ class ModelSession:
         self._bound: dict[tuple[Any, ...], tuple[Any, dict[str, Any], dict[str, Any]]] = {}
 
     def run(self, feeds: Mapping[str, NDArray[Any]], shapes: Mapping[str, Shape]) -> dict[str, NDArray[Any]]:
-        """Run the model on inputs by name, and return outputs of these shapes, valid until the next run with the same.
-        Raises ModelFailure if onnxruntime failed.
+        """Run the model on inputs by name, and return outputs of these shapes, valid until the next run with
+        the same. Raises ModelFailure if onnxruntime failed.
         """
         key = (*((name, array.shape) for name, array in feeds.items()), *shapes.items())
         try:
@@ -137,8 +137,8 @@ class ModelSession:
                     raise InputError(path, f"{field}.{item.name}", problem)
 
     def check_fits(self, source: Path, feeds: Mapping[str, Shape], answers: Mapping[str, Shape]) -> None:
-        """Check the shapes of the graph's inputs and outputs by name, if need be by running it. Raises InputError if
-        one differs, or the model does not run with these shapes.
+        """Check the shapes of the graph's inputs and outputs by name, if need be by running it. Raises
+        InputError if one differs, or the model does not run with these shapes.
         """
         is_open = False
         for field, items, shapes in (
@@ -175,8 +175,8 @@ class ModelSession:
 
 
 def nodes_elsewhere(session: Any, provider: str) -> tuple[str, ...]:
-    """Return the names, or else operators, of graph nodes that do not run on the requested provider. The session needs
-    the option `RECORD_NODES`. Only nodes left after basic optimizations count.
+    """Return the names, or else operators, of graph nodes that do not run on the requested provider. The
+    session needs the option `RECORD_NODES`. Only nodes left after basic optimizations count.
     """
     return tuple(
         node.name or node.op_type

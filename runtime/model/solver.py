@@ -37,7 +37,7 @@ REFINING = (Step(size=0.8, places="falling"), Step(size=0.8, places="rising"))  
 
 
 def steps_from_even(steps: int) -> tuple[Step, ...]:
-    """Return the steps to run without a network, instead of `steps`, from panels solved on coarser rasters."""
+    """Return the steps to run without a network, instead of `steps`, from coarser rasters."""
     sizes = (1.2,) * (2 * steps) + (0.8,) * steps
     return tuple(Step(size=size, places=IN_TURN[n % 4]) for n, size in enumerate(sizes))
 

@@ -30,9 +30,9 @@ def solve_still(
     trimmed: bool = False,
     steps: int | None = None,
 ) -> Prediction:
-    """Compute the layers for each eye's picture, taken by a camera at the eye that is aimed at the stack's origin. The
-    solver follows the rays of the picture pixels. `trimmed` skips work that the pictures do not need, if the model
-    supports it; `steps` defaults to the model's.
+    """Compute the layers for each eye's picture, taken by a camera at the eye that is aimed at the
+    stack's origin. The solver follows the rays of the picture pixels. `trimmed` skips work that the pictures do not
+    need, if the model supports it; `steps` defaults to the model's.
     """
     watch = Stopwatch(*STAGES)
     codes = [np.ascontiguousarray(picture[..., :3]) for picture in pictures]
@@ -47,7 +47,7 @@ def solve_still(
 def captured_views(
     pictures: Sequence[U8], eyes_m: Eyes, stack: PanelStack, *, fov_deg: float
 ) -> tuple[TargetView, ...]:
-    """Return the views for pictures of one size, of cameras aimed at the origin, resized to the panels' pixels."""
+    """Return the views for pictures of cameras aimed at the origin, resized to the panels' pixels."""
     height, width = pictures[0].shape[:2]
     middle = stack.panel(stack.count // 2)
     at = [image_from_stack(eye_m, width_px=width, height_px=height, fov_deg=fov_deg) for eye_m in eyes_m]

@@ -22,15 +22,15 @@ def rest_of(panels: int) -> int:
 
 
 def slope_of(panels: int) -> int:
-    """Return which slope of sin², from 0, contains the sums of panel values: 1 falls (1 to 2), 2 rises (2 to 3)."""
+    """Return which slope of sin² contains the sums of panel values: 1 falls (1 to 2), 2 rises (2 to 3)."""
     return int(rest_value(panels) * panels)
 
 
 @lru_cache(maxsize=8)
 def target_table(panels: int) -> F32:
-    """Return the (256, 2) target sums of panel values, in sixteenths of a code, and weights, by the code to be seen. Of
-    all the sums that show a code, the target is the one nearest to the panels' rest values. The weight depends on the
-    slope of sin² at the target and is 1 where the slope is steepest.
+    """Return the (256, 2) target sums of panel values, in sixteenths of a code, and weights, by the code
+    to be seen. Of all the sums that show a code, the target is the one nearest to the panels' rest values. The weight
+    depends on the slope of sin² at the target and is 1 where the slope is steepest.
     """
     intensities = np.arange(256) / 255.0
     slope = slope_of(panels)
@@ -48,7 +48,7 @@ def middle_codes(panels: int) -> U8:
 
 
 def outside_codes(panels: int, n: int, outside: int | tuple[int, ...]) -> list[int]:
-    """Return panel `n`'s RGB code outside the window, given the middle panel's code or the colour seen; others rest."""
+    """Return panel `n`'s RGB code outside the window, given the middle panel's or the colour seen."""
     if n != panels // 2:
         return [rest_code(panels)] * 3
     return middle_codes(panels)[list(outside)].tolist() if isinstance(outside, tuple) else [outside] * 3
@@ -56,7 +56,7 @@ def outside_codes(panels: int, n: int, outside: int | tuple[int, ...]) -> list[i
 
 @lru_cache(maxsize=4)
 def phase_codes(branch: Branch = 2) -> I16:
-    """Return the (256,) sums of panel values, in sixteenths of a code, for the codes that an eye may have to see."""
+    """Return the (256,) sums of panel values, in sixteenths of a code, for each code to be seen."""
     codes = np.arange(256) / 255.0
     return np.rint(phase_from_intensity(codes, branch) * FULL).astype(np.int16)
 

@@ -42,7 +42,7 @@ COMPARED = 2  # captured pictures are compared on a raster this many times as co
 
 
 def trim(job: Job, before: SolveWindow | None = None) -> Job:
-    """Return a job that solves only its window, or where pictures differ, and one channel if they are grey."""
+    """Return a job that solves only its window, or where pictures differ, and one channel if grey."""
     window = job.window or differing_window(job, before)
     grey = (window is None or window.box.width_px > 0) and all(_is_grey(view, job, window) for view in job.views)
     return replace(job, window=window, channels=1 if grey else job.channels)
@@ -51,8 +51,8 @@ def trim(job: Job, before: SolveWindow | None = None) -> Job:
 def extent_window(
     extent: PixelRect, colour: tuple[int, ...], eyes_m: Eyes, stack: PanelStack, before: SolveWindow | None = None
 ) -> SolveWindow | None:
-    """Return the window for content whose extent, in middle-panel pixels, is known before it is drawn. Outside, both
-    eyes see only the background, whose codes are `colour`. None also if the extent is empty.
+    """Return the window for content whose extent, in middle-panel pixels, is known before it is drawn.
+    Outside, both eyes see only the background, whose codes are `colour`. None also if the extent is empty.
     """
     if not extent.width_px:
         return None
@@ -62,7 +62,7 @@ def extent_window(
 
 
 def differing_window(job: Job, before: SolveWindow | None = None) -> SolveWindow | None:
-    """Return the window where pictures differ, empty if they agree. None also if a picture is in a texture."""
+    """Return the window where pictures differ, maybe empty. None also if a picture is in a texture."""
     if any(isinstance(view.picture, DrawnPicture) for view in job.views):
         return None
     stack = job.stack
@@ -137,8 +137,8 @@ def _is_grey(view: TargetView, job: Job, window: SolveWindow | None) -> bool:
 
 
 def differing_box(left: U8, right: U8, *, tolerance: int = TOLERANCE_CODES, known: PixelRect = NOWHERE) -> PixelRect:
-    """Return the smallest box, maybe empty, of all differences above `tolerance` codes between (h, w, 3 or 4) pictures.
-    Pixels in `known`, a part of the result such as that of `coarse_box`, are not compared.
+    """Return the smallest box, maybe empty, of all differences above `tolerance` codes between (h, w, 3
+    or 4) pictures. Pixels in `known`, a part of the result such as that of `coarse_box`, are not compared.
     """
     height, width = left.shape[:2]
 
@@ -151,8 +151,8 @@ def differing_box(left: U8, right: U8, *, tolerance: int = TOLERANCE_CODES, know
 
 
 def coarse_box(left: U8, right: U8, *, tolerance: int = TOLERANCE_CODES) -> PixelRect:
-    """Return a box inside the result of `differing_box`, in a hundredth of the time. Only a few pixels are compared,
-    enough to tell if the window would be too large to be useful.
+    """Return a box inside the result of `differing_box`, in a hundredth of the time. Only a few pixels
+    are compared, enough to tell if the window would be too large to be useful.
     """
     few = [np.ascontiguousarray(picture[::COARSE_STEP, ::COARSE_STEP]) for picture in (left, right)]
     u0, v0, u1, v1 = (COARSE_STEP * corner for corner in _box(few[0], few[1], tolerance).corners)
@@ -167,22 +167,22 @@ def _box(left: U8, right: U8, tolerance: int) -> PixelRect:
 
 
 def parallax_margin_px(eyes_m: Eyes, stack: PanelStack) -> F64:
-    """Return (V, N, 2) shifts, right and down, of rays through the middle panel's centre on each panel, in pixels. For
-    rays through other points on the middle panel, they are approximate.
+    """Return (V, N, 2) shifts, right and down, of rays through the middle panel's centre on each panel,
+    in pixels. For rays through other points on the middle panel, they are approximate.
     """
     return _scale_shift_px(eyes_m, stack)[1]
 
 
 def steepness(codes: U8) -> float:
-    """Return how visible phase errors are on 8-bit codes, from 0 (black or white) to 1 (mid-grey). The result is the
-    root mean square of the slope of sin², 2·sqrt(I·(1 - I)).
+    """Return how visible phase errors are on 8-bit codes, from 0 (black or white) to 1 (mid-grey). The
+    result is the root mean square of the slope of sin², 2·sqrt(I·(1 - I)).
     """
     intensities = codes.astype(np.float64) / 255
     return float(np.sqrt((4 * intensities * (1 - intensities)).mean())) if codes.size else 0.0
 
 
 def steepness_beside(picture: U8, box: PixelRect) -> float:
-    """Return the larger `steepness` of the areas left and right of a box, where the outer panels are tapered."""
+    """Return the larger `steepness` left and right of a box, where the outer panels are tapered."""
     rows = slice(box.v0, box.v1, COARSE_STEP)
     beside = (picture[rows, : box.u0 : COARSE_STEP, :3], picture[rows, box.u1 :: COARSE_STEP, :3])
     return max(steepness(side) for side in beside)
@@ -201,8 +201,8 @@ def taper_px(eyes_m: Eyes, stack: PanelStack, *, parallaxes: float) -> tuple[flo
 
 
 def whole_rays(box: PixelRect, eyes_m: Eyes, stack: PanelStack) -> PixelRect:
-    """Return the part of a window, in panel pixels, where rays stay inside it on every panel, except at panel edges.
-    The eyes are not relative to the window.
+    """Return the part of a window, in panel pixels, where rays stay inside it on every panel, except at
+    panel edges. The eyes are not relative to the window.
     """
     scale, shift_px = _scale_shift_px(eyes_m, stack)
     limits = []
@@ -227,8 +227,8 @@ def _scale_shift_px(eyes_m: Eyes, stack: PanelStack) -> tuple[F64, F64]:
 
 
 def window_around(box: PixelRect, eyes_m: Eyes, stack: PanelStack, *, parallaxes: float) -> PixelRect | None:
-    """Return the window, with margins for a taper of `parallaxes`, to solve a box where pictures differ. Its sides are
-    rounded up to sixteenths of the panel's.
+    """Return the window, with margins for a taper of `parallaxes`, to solve a box where pictures differ.
+    Its sides are rounded up to sixteenths of the panel's.
     """
     scale, shift_px = _scale_shift_px(eyes_m, stack)
     spans: list[tuple[int, int]] = []

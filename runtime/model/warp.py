@@ -23,7 +23,7 @@ _TRANSPOSED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 def source_px(image_from_raster: F64, size: tuple[int, int]) -> tuple[float, float]:
-    """Return how many image pixels a raster pixel spans, right and down, at the centre of a (width, height) raster."""
+    """Return how many image pixels a pixel spans, right and down, at a (width, height) raster's centre."""
     a = image_from_raster
     x, y, w = a @ (size[0] / 2, size[1] / 2, 1.0)
     across, down = np.linalg.norm((a[:2, :2] - np.outer((x / w, y / w), a[2, :2])) / w, axis=0)
@@ -36,7 +36,7 @@ def resized_px(pixels: int, scale: float) -> int:
 
 
 def reduced_view(view: TargetView, middle: PlaneRaster, reduction: int) -> TargetView:
-    """Average a view's picture to about one pixel per `reduction` x `reduction` pixels of the middle panel's grid."""
+    """Average a picture to about one pixel per `reduction` x `reduction` pixels of the middle panel."""
     picture = view.pixels
     picture_from_middle = np.linalg.inv(view.plane_from_picture) @ middle.plane_from_raster()
     scales = source_px(picture_from_middle, (middle.width_px, middle.height_px))
@@ -55,8 +55,8 @@ def reduced_view(view: TargetView, middle: PlaneRaster, reduction: int) -> Targe
 def picture_on(
     view: TargetView, middle: PlaneRaster, *, middle_from_result: F64, edge: int, size: tuple[int, int]
 ) -> U8:
-    """Resample a view's picture to a raster of (rows, columns), unless its pixels already coincide. `middle` is the
-    middle panel's grid, `middle_from_result` the map to it, and `edge` OpenCV's border mode.
+    """Resample a view's picture to a raster of (rows, columns), unless its pixels already coincide.
+    `middle` is the middle panel's grid, `middle_from_result` the map to it, and `edge` OpenCV's border mode.
     """
     picture_from_result = np.linalg.inv(view.plane_from_picture) @ middle.plane_from_raster() @ middle_from_result
     picture_from_result = picture_from_result / picture_from_result[2, 2]
@@ -85,7 +85,8 @@ def warp(
     result_columns: ColumnLaw = EVEN_COLUMNS,
     threads: int | None = None,
 ) -> I16:
-    """Resample an (h, w[, 3]) int16 image, clipped to ±8191, as `resample` does, but several times as fast.
+    """Resample an (h, w[, 3]) int16 image, clipped to ±8191, as `resample` does, but several times as
+    fast.
 
     The 3x3 homography maps columns, as the coordinates t of the column laws, of which one must be even, and rows of the
     result, `size` (rows, columns), to the image's. Edges are repeated outwards for `reach_px`, at most `REACH_PX`;

@@ -45,13 +45,14 @@ class Alignment:
 
 
 def reference_plane(stack: PanelStack) -> Plane:
-    """Return the plane on which aligned content stays: the centre panel's, or halfway between the two middle panels."""
+    """Return the plane where aligned content stays: the centre panel's, or between the middle two."""
     half = stack.count // 2
     return Plane(stack.x_m[half] if stack.count % 2 else (stack.x_m[half - 1] + stack.x_m[half]) / 2)
 
 
 def align(stack: PanelStack, *, solved_for_m: Eyes, eyes_m: Eyes) -> Alignment:
-    """Align layers that were solved for other eye positions to the current eyes. Never raises an exception.
+    """Align layers that were solved for other eye positions to the current eyes. Never raises an
+    exception.
 
     At the limits `NEAREST_M`, `MOST_SHIFT` and `MOST_SCALE`, the layers are aligned to the farthest allowed point on
     the straight line from the old eyes to the current eyes, so that the alignment stays continuous. If a coordinate is

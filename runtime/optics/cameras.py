@@ -24,9 +24,9 @@ Picture = U8 | F32  # (h, w, 3)
 
 
 def as_cameras(matrices: Any, *, count: int = 2) -> tuple[F64, F64]:
-    """Return the (V, 3, 4) projections and (V, 3) positions of cameras, given their 3x4 matrices from metres in `stack`
-    to pixels. Signs are chosen so that the third homogeneous coordinate is positive in front of the camera. Raises
-    ValueError if a matrix is not finite or its left 3x3 part has no inverse.
+    """Return the (V, 3, 4) projections and (V, 3) positions of cameras, given their 3x4 matrices from
+    metres in `stack` to pixels. Signs are chosen so that the third homogeneous coordinate is positive in front of the
+    camera. Raises ValueError if a matrix is not finite or its left 3x3 part has no inverse.
     """
     try:
         cameras = np.asarray(matrices, np.float64)
@@ -46,9 +46,9 @@ def as_cameras(matrices: Any, *, count: int = 2) -> tuple[F64, F64]:
 def looking_at_origin(
     pictures: Sequence[Picture], cameras: F64, eyes_m: Eyes, stack: PanelStack
 ) -> tuple[list[Picture], float]:
-    """Resample pictures as if their cameras had been aimed at the stack's origin; return them and their fov_deg. The
-    new pictures cover as much of the panels as all originals allow, and are sampled bicubically. Aimed pictures are
-    returned unchanged. Raises ValueError if a picture does not show the stack's centre.
+    """Resample pictures as if their cameras had been aimed at the stack's origin; return them and their
+    fov_deg. The new pictures cover as much of the panels as all originals allow, and are sampled bicubically. Aimed
+    pictures are returned unchanged. Raises ValueError if a picture does not show the stack's centre.
     """
     height, width = pictures[0].shape[:2]
     turns = [np.diag([1.0, -1.0, -1.0]) @ stack_from_eye(eye_m)[:3, :3].T for eye_m in eyes_m]

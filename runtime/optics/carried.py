@@ -34,7 +34,7 @@ def carried_db(
     eyes_m: ArrayLike,
     fov_deg: float,
 ) -> float:
-    """Return the PSNR of layers seen from `eyes_m`, one ray per pixel. Raises ValueError as `squared_errors` does."""
+    """Return the PSNR of layers seen from `eyes_m`, one ray per pixel. Raises as `squared_errors`."""
     targets = [intensities(picture) for picture in drawn]
     solved_for, eyes = np.asarray(solved_for_m, np.float64), np.asarray(eyes_m, np.float64)
     errors = squared_errors(
@@ -60,7 +60,8 @@ def expected_errors(
     sampling: Sampling | None = None,
     **at: Unpack[AtEyes],
 ) -> dict[float, F64]:
-    """Return the squared errors (1 + groups,) to expect for each standard deviation of the tracking, in mm.
+    """Return the squared errors (1 + groups,) to expect for each standard deviation of the tracking, in
+    mm.
 
     The expectation is a weighted sum over five eye positions, which reproduces second moments exactly: weight 1/2
     without tracking error, 1/8 each at two standard deviations to the left and right, above and below. There, only a
@@ -109,8 +110,8 @@ def expected_psnrs_db(
 
 
 def standard_error_db(errors: F64) -> float:
-    """Return a PSNR's standard error in dB, from the scatter of errors (1 + groups,): over all rows, then over each
-    group.
+    """Return a PSNR's standard error in dB, from the scatter of errors (1 + groups,): over all rows, then
+    over each group.
     """
     groups = errors[1:]
     relative = float(np.std(groups, ddof=1)) / len(groups) ** 0.5 / max(float(errors[0]), 1e-12)

@@ -38,7 +38,8 @@ class _Compared:
     panel: PlaneRaster
 
     def ghosts(self, unit_m: float) -> float:
-        """Estimate the RMS light that reaches the wrong eye because panel values are limited, relative to full scale.
+        """Estimate the RMS light that reaches the wrong eye because panel values are limited, relative to
+        full scale.
 
         The two eyes' rays through a point on the front panel cross the middle panel `unit_m` apart; through a point on
         the rear panel, the same distance apart in reverse order. The difference between the eyes' pictures is therefore
@@ -59,8 +60,8 @@ class _Compared:
         return float(np.sqrt(np.mean((share * (light[0] - light[1]) / 2)[both] ** 2))) if both.any() else 0.0
 
     def disparities_m(self) -> F64:
-        """Return the (n,) disparities of unambiguously matched points, in metres on the middle panel, positive in front
-        of it. The result is empty if most of the picture is repetitive or too few points match.
+        """Return the (n,) disparities of unambiguously matched points, in metres on the middle panel,
+        positive in front of it. The result is empty if most of the picture is repetitive or too few points match.
         """
         sides = 0, 0, REACH_PX, REACH_PX
         framed: list[Any] = [
@@ -123,8 +124,9 @@ def _is_ambiguous(left: U8, right: U8, matched: F64) -> NDArray[np.bool_]:
 def disparity_doubts(
     pictures: Sequence[U8 | F32], eyes_m: Eyes, stack: PanelStack, *, fov_deg: float, parallel: bool = True
 ) -> list[str]:
-    """Return a one-line warning, in a list, if the pictures will cause ghosts, or an empty list. `parallel`: they may
-    be a rectified pair from parallel cameras, passed by mistake; the warning says so if it seems so.
+    """Return a one-line warning, in a list, if the pictures will cause ghosts, or an empty list.
+    `parallel`: they may be a rectified pair from parallel cameras, passed by mistake; the warning says so if it seems
+    so.
     """
     line = eyes_m[1] - eyes_m[0]
     if line[1] <= 0 or abs(line[2]) > ROLLED * line[1] or abs(line[0]) > TURNED * line[1]:

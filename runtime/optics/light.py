@@ -65,7 +65,8 @@ def squared_errors(
     fov_deg: float,
     sampling: Sampling,
 ) -> F64:
-    """Return the mean squared errors (1 + groups,) of the light that reaches the eyes, compared with carried targets.
+    """Return the mean squared errors (1 + groups,) of the light that reaches the eyes, compared with
+    carried targets.
 
     A carried target is a picture treated as if it were painted on the centre panel (docs/contracts.md). A pixel counts
     if all its rays cross every panel at least half a pixel inside the panel's edge. The first error is over all rows,
@@ -115,8 +116,8 @@ def _squared_error(
 def view_of(
     side: int, nominal_m: F64, true_m: F64, target: F32, stack: PanelStack, *, fov_deg: float, pupil_mm: float
 ) -> LightView:
-    """Return one eye's target and rays. The eye is a pinhole if `pupil_mm`, its diameter, is 0. Raises ValueError if
-    the nominal eye or a point on the true eye's pupil is not in front of every panel.
+    """Return one eye's target and rays. The eye is a pinhole if `pupil_mm`, its diameter, is 0. Raises
+    ValueError if the nominal eye or a point on the true eye's pupil is not in front of every panel.
     """
     height, width = target.shape[:2]
     rays = Rays.of_eye(checked_eye(nominal_m, stack), width_px=width, height_px=height, fov_deg=fov_deg)
@@ -132,7 +133,7 @@ def first_ray(side: int) -> int:
 
 
 def panels_from_centre(true_m: F64, stack: PanelStack) -> F64:
-    """Return the (..., N, 3, 3) homographies from centre-panel pixels to every layer's pixels along each eye's rays."""
+    """Return homographies (..., N, 3, 3) from centre-panel to layer pixels along each eye's rays."""
     centre = stack.panel(stack.count // 2)
     matrices = np.stack([centre.to(stack.panel(n), true_m) for n in range(stack.count)], axis=-3)
     if stack.tilt is not None:

@@ -31,8 +31,9 @@ def intensity_from_phase(phase: NDArray[T]) -> NDArray[T]:
 
 
 def phase_from_intensity(intensity: NDArray[T], branch: Branch = 2) -> NDArray[T]:
-    """Return the sum of panel values, the phase in units of π/2, that produces an intensity, which is clipped to [0,
-    1]. The sum is in [0, 1] on branch 1 and in [1, 2] on branch 2, which keeps three panels far from their limits.
+    """Return the sum of panel values, the phase in units of π/2, that produces an intensity, which is
+    clipped to [0, 1]. The sum is in [0, 1] on branch 1 and in [1, 2] on branch 2, which keeps three panels far from
+    their limits.
     """
     root = np.arcsin(np.sqrt(np.clip(intensity, 0.0, 1.0))) / HALF_PI
     result: NDArray[T] = root if branch == 1 else 2 - root

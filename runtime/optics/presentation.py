@@ -51,7 +51,7 @@ class PixelMap(NamedTuple):
 
 
 def scale_and_shift(matrix: F64) -> PixelMap:
-    """Return the scale and shift that a 3x3 matrix consists of. Raises ValueError if it does anything else."""
+    """Return the scale and shift that a 3x3 matrix consists of. Raises ValueError for anything else."""
     (su, a, tu), (b, sv, tv), last = matrix.tolist()
     if a or b or last != [0.0, 0.0, 1.0]:
         raise ValueError("an alignment must be a scale and a shift")
@@ -131,9 +131,9 @@ def flatness_of(frame: PanelFrame) -> float:
 def panel_draws(
     frame: PanelFrame, mounts: Sequence[Mount] = (), *, between: Interpolation = Interpolation.CUBIC
 ) -> tuple[PanelDraw, ...]:
-    """Return what each panel shows for a frame on its monitor, by default one that has the panel's own pixels.
-    `between` is how to read the solution where a monitor's pixels do not coincide with the layer's. Raises ValueError
-    if the frame has no flat picture, but needs one.
+    """Return what each panel shows for a frame on its monitor, by default one that has the panel's own
+    pixels. `between` is how to read the solution where a monitor's pixels do not coincide with the layer's. Raises
+    ValueError if the frame has no flat picture, but needs one.
     """
     flatness, pictures = flatness_of(frame), frame.flat if frame.solved is None else frame.solved
     if pictures is None or (flatness > 0.0 and frame.flat is None):
@@ -184,8 +184,8 @@ def _moves(
 
 
 def shown_layers(frame: PanelFrame) -> U8:
-    """Return a frame's (N, h, w, 4) layers as shown, before curves, rotation and mirroring, without a copy if possible.
-    Raises ValueError if the frame needs a flat picture but has none.
+    """Return a frame's (N, h, w, 4) layers as shown, before curves, rotation and mirroring, without a
+    copy if possible. Raises ValueError if the frame needs a flat picture but has none.
     """
     draws = panel_draws(frame)
     if frame.solved is None or not draws[0].shows_solved:
@@ -198,8 +198,8 @@ def shown_layers(frame: PanelFrame) -> U8:
 
 
 def shown_picture(draw: PanelDraw, solved: U8 | None, flat: U8 | None) -> U8:
-    """Return the (h, w, 4) picture that a monitor shows: the reference for all other implementations. Only the pictures
-    that `draw` shows are needed.
+    """Return the (h, w, 4) picture that a monitor shows: the reference for all other implementations.
+    Only the pictures that `draw` shows are needed.
     """
     if draw.copies_solved:
         assert solved is not None

@@ -29,7 +29,7 @@ def psnr_db(mean_squared_error: float) -> float:
 
 
 def ssim(a: F32, b: F32, mask: Mask) -> float:
-    """Return the mean SSIM of two images over a mask (Wang et al. 2004; 11x11 Gaussian window of sigma 1.5 pixels)."""
+    """Return the mean SSIM over a mask (Wang et al. 2004; 11x11 Gaussian window of sigma 1.5 pixels)."""
 
     def blur(x: F32) -> F32:
         return np.asarray(cv2.GaussianBlur(x, (11, 11), 1.5), dtype=np.float32)[inside]
@@ -64,7 +64,7 @@ def squared_error(image: F32, target: F32, mask: Mask) -> tuple[float, int]:
 
 
 def quality(seen: Sequence[F32], targets: Sequence[F32], masks: Sequence[Mask], *, similarity: bool = True) -> Quality:
-    """Return the quality of what eyes see; without `similarity`, SSIM is NaN. Raises ValueError if nothing counts."""
+    """Return the quality of what eyes see; SSIM may be NaN. Raises ValueError if no pixel counts."""
     errors, weights, per_eye, similarities = 0.0, 0, [], []
     for image, target, mask in zip(seen, targets, masks, strict=True):
         squared, counted = squared_error(image, target, mask)

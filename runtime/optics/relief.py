@@ -32,9 +32,10 @@ def block_px(width_px: int) -> int:
 
 
 def relief_of(nearness: Sequence[F32], *, distance_m: Sequence[float], rim_px: int = RIM_PX) -> F32:
-    """Combine the depth seen by the two eyes into one (h, w) relief: for each pixel, that with the larger magnitude.
-    `nearness` are inverse distances along x in 1/m, 0 for the background, and `distance_m` each eye's distance from the
-    middle panel. Nearer content is dilated by `rim_px` relief pixels. Relief that is not finite becomes 0.
+    """Combine the depth seen by the two eyes into one (h, w) relief: for each pixel, that with the larger
+    magnitude. `nearness` are inverse distances along x in 1/m, 0 for the background, and `distance_m` each eye's
+    distance from the middle panel. Nearer content is dilated by `rim_px` relief pixels. Relief that is not finite
+    becomes 0.
     """
     rim = np.ones((2 * rim_px + 1,) * 2, np.uint8)
     reliefs = []
@@ -47,8 +48,8 @@ def relief_of(nearness: Sequence[F32], *, distance_m: Sequence[float], rim_px: i
 
 
 def parallax(stack: PanelStack, *, old_m: F64, new_m: F64) -> Parallax | None:
-    """Return how the content moves when the midpoint between the eyes moves from `old_m` to `new_m`, in frame `stack`.
-    None if it has not moved, or if there is no middle panel (an even number of panels).
+    """Return how the content moves when the midpoint between the eyes moves from `old_m` to `new_m`, in
+    frame `stack`. None if it has not moved, or if there is no middle panel (an even number of panels).
     """
     if stack.count % 2 == 0 or np.array_equal(old_m, new_m):
         return None

@@ -88,8 +88,8 @@ class Rays:
         return result
 
     def toward(self) -> F64:
-        """Return the (3,) vector whose dot product with (u, v, 1) is a ray's x component in frame `stack`. The x
-        component is negative for rays towards the panels.
+        """Return the (3,) vector whose dot product with (u, v, 1) is a ray's x component in frame `stack`.
+        The x component is negative for rays towards the panels.
         """
         # A ray's direction is the inverse of the projection's left 3x3 part, times (u, v, 1).
         return np.asarray(np.linalg.inv(self.from_stack[:, :3])[0])
@@ -176,8 +176,8 @@ def as_codes(image: F32) -> U8:
 
 
 def pupil_points(diameter_m: float, rings: int = 2) -> F64:
-    """Return (K, 2) points that cover a round pupil evenly. Each point is an offset (right, up) from the pupil's centre
-    in metres. The first point is the centre.
+    """Return (K, 2) points that cover a round pupil evenly. Each point is an offset (right, up) from the
+    pupil's centre in metres. The first point is the centre.
     """
     points = [(0.0, 0.0)]
     for ring in range(1, rings + 1):
@@ -188,8 +188,8 @@ def pupil_points(diameter_m: float, rings: int = 2) -> F64:
 
 
 def average(images: Iterable[F32]) -> F32:
-    """Return the (h, w, C) mean of the images seen from the points on a finite pupil. Raises ValueError if there are no
-    images.
+    """Return the (h, w, C) mean of the images seen from the points on a finite pupil. Raises ValueError
+    if there are no images.
     """
     total: F32 | None = None
     count = 0

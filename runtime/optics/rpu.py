@@ -13,9 +13,9 @@ from runtime.records import F64
 
 
 def panel_from_image(image_from_stack: F64, raster: PlaneRaster) -> F64:
-    """Return M_RPU (equation (47)), the 3x3 homography from image pixels to panel pixels; its largest entry has
-    magnitude 1. Computed as an adjugate, which stays accurate at grazing angles. Raises ValueError if the eye is in the
-    panel's plane or the projection is not finite.
+    """Return M_RPU (equation (47)), the 3x3 homography from image pixels to panel pixels; its largest
+    entry has magnitude 1. Computed as an adjugate, which stays accurate at grazing angles. Raises ValueError if the eye
+    is in the panel's plane or the projection is not finite.
     """
     h = image_from_raster(image_from_stack, raster)
     adjugate = np.array([np.cross(h[:, 1], h[:, 2]), np.cross(h[:, 2], h[:, 0]), np.cross(h[:, 0], h[:, 1])])

@@ -14,8 +14,8 @@ Pixels = NDArray[np.floating[Any]]
 
 
 def bilinear(picture: U8 | F32, x: Pixels, y: Pixels) -> F32:
-    """Return an (H, W[, C]) picture's values at positions x and y (NaN counts as 0), which are broadcast to (h, w).
-    Weights have full precision, which OpenCV's own interpolation does not offer.
+    """Return an (H, W[, C]) picture's values at positions x and y (NaN counts as 0), which are broadcast
+    to (h, w). Weights have full precision, which OpenCV's own interpolation does not offer.
     """
     height, width = picture.shape[:2]
     left, right = _split(x, width)

@@ -33,8 +33,8 @@ class Plane:
     x_m: float
 
     def scale_shift_to(self, other: Plane, eye_m: ArrayLike) -> tuple[F64, F64]:
-        """Return the scales (...) and shifts (..., 2) in metres by which rays from eyes (..., 3) project this plane
-        onto another. The point p is projected to p·scale + shift. Raises ValueError if an eye is in this plane.
+        """Return the scales (...) and shifts (..., 2) in metres by which rays from eyes (..., 3) project this
+        plane onto another. The point p is projected to p·scale + shift. Raises ValueError if an eye is in this plane.
         """
         eye = np.asarray(eye_m, np.float64)
         distance_m = eye[..., 0] - self.x_m
@@ -54,8 +54,8 @@ class Plane:
 
 @dataclass(frozen=True, slots=True)
 class PlaneRaster:
-    """Pixel grid on the plane x = x_m in `stack`: the pixel (u, v) is at y = left_m + u·pitch_u_m, z = top_m -
-    v·pitch_v_m.
+    """Pixel grid on the plane x = x_m in `stack`: the pixel (u, v) is at y = left_m + u·pitch_u_m, z =
+    top_m - v·pitch_v_m.
     """
 
     x_m: float
@@ -71,15 +71,15 @@ class PlaneRaster:
         return Plane(self.x_m)
 
     def to(self, other: PlaneRaster, eye_m: ArrayLike) -> F64:
-        """Return the (..., 3, 3) maps to another raster's pixels along the rays of eyes (..., 3). Raises ValueError if
-        an eye is in this raster's plane.
+        """Return the (..., 3, 3) maps to another raster's pixels along the rays of eyes (..., 3). Raises
+        ValueError if an eye is in this raster's plane.
         """
         return np.asarray(other.raster_from_plane() @ self.plane.to(other.plane, eye_m) @ self.plane_from_raster())
 
     def to_and_back(self, via: Plane, *, old_m: Sequence[float], step_m: Sequence[float]) -> F64:
-        """Return the 3x3 map of pixels onto a plane from the eye at old_m + step_m, and back from the eye at old_m.
-        Exactly the identity if the step is zero or the plane is the raster's. `optics.alignment` derives the equation.
-        Plain floats are several times as fast here as small arrays.
+        """Return the 3x3 map of pixels onto a plane from the eye at old_m + step_m, and back from the eye at
+        old_m. Exactly the identity if the step is zero or the plane is the raster's. `optics.alignment` derives the
+        equation. Plain floats are several times as fast here as small arrays.
         """
         distance_m, height_m = old_m[0] - self.x_m, old_m[0] - via.x_m
         now_m = distance_m + step_m[0]

@@ -35,8 +35,8 @@ def layer_pixels_from_seen(raster: PlaneRaster, layer_from_seen_m: F64) -> F64:
 
 
 def coarse_layer_from_seen(stack: PanelStack, index: int, eye_m: F64) -> F64:
-    """Return the simplest map that approximates `layer_from_seen` to `UNSEEN_PX` at nine points of the panel.
-    Candidates: the identity, a scale and shift (fast to resample), an affine map, and the exact homography.
+    """Return the simplest map that approximates `layer_from_seen` to `UNSEEN_PX` at nine points of the
+    panel. Candidates: the identity, a scale and shift (fast to resample), an affine map, and the exact homography.
     """
     if stack.tilt is None or not any(stack.tilt.depth[index]):
         return np.eye(3)

@@ -15,9 +15,10 @@ from runtime.records import F64
 
 
 def stack_from_eye(eye_m: ArrayLike) -> F64:
-    """Return the 4x4 pose of an eye that looks at the stack's origin (EyeReal supplement, (10)-(14)). x points right
-    and is parallel to the ground, y points up, and z from the scene towards the eye. For an eye on the vertical axis,
-    the pose is the limit from +x (r_x = +y). Raises ValueError if the eye is at the origin or not finite.
+    """Return the 4x4 pose of an eye that looks at the stack's origin (EyeReal supplement, (10)-(14)). x
+    points right and is parallel to the ground, y points up, and z from the scene towards the eye. For an eye on the
+    vertical axis, the pose is the limit from +x (r_x = +y). Raises ValueError if the eye is at the origin or not
+    finite.
     """
     eye = np.asarray(eye_m, dtype=np.float64)
     scale = float(np.abs(eye).max())
@@ -43,8 +44,9 @@ def image_from_camera(*, width_px: int, height_px: int, fov_deg: float) -> F64:
 
 
 def image_from_stack(eye_m: ArrayLike, *, width_px: int, height_px: int, fov_deg: float) -> F64:
-    """Return the 3x4 projection from `stack` to an eye's image, K·diag(1, -1, -1)·R_e^T·[I | -e] ((31)-(39)). The third
-    homogeneous coordinate is the distance along the gaze in metres, positive in front of the eye.
+    """Return the 3x4 projection from `stack` to an eye's image, K·diag(1, -1, -1)·R_e^T·[I | -e]
+    ((31)-(39)). The third homogeneous coordinate is the distance along the gaze in metres, positive in front of the
+    eye.
     """
     pose = stack_from_eye(eye_m)
     rotation = np.diag([1.0, -1.0, -1.0]) @ pose[:3, :3].T
@@ -54,8 +56,8 @@ def image_from_stack(eye_m: ArrayLike, *, width_px: int, height_px: int, fov_deg
 
 
 def raster_from_stack(eye_m: ArrayLike, raster: PlaneRaster) -> F64:
-    """Return the 3x4 projection from `stack` to raster pixels along an eye's rays: M_RPU times any `image_from_stack`.
-    The third homogeneous coordinate is the distance from the point to the eye along x, in metres.
+    """Return the 3x4 projection from `stack` to raster pixels along an eye's rays: M_RPU times any
+    `image_from_stack`. The third homogeneous coordinate is the distance from the point to the eye along x, in metres.
     """
     eye = np.asarray(eye_m, dtype=np.float64)
     depth = raster.x_m - eye[0]

@@ -17,9 +17,9 @@ CONNECTIONS_MAX = 64  # maximum number of simultaneous connections
 
 
 class LimitedConnection(H11Protocol):
-    """HTTP connection that is closed if it is still waiting longer than `REQUEST_S` for a request. The wait begins when
-    the connection is opened, and again after each answer. If there are more than `CONNECTIONS_MAX` connections, the one
-    that has waited longest is closed.
+    """HTTP connection that is closed if it is still waiting longer than `REQUEST_S` for a request. The
+    wait begins when the connection is opened, and again after each answer. If there are more than `CONNECTIONS_MAX`
+    connections, the one that has waited longest is closed.
     """
 
     def connection_made(self, transport: Any) -> None:
@@ -54,7 +54,7 @@ class LimitedConnection(H11Protocol):
 
 
 def listening(command: str, port: int) -> sockets.socket:
-    """Return a socket that listens on a loopback port. Raises InputError, which names the command, if that fails."""
+    """Return a socket that listens on a loopback port. Raises InputError, which names the command."""
     try:
         return sockets.create_server((LOOPBACK, port))
     except OSError as error:

@@ -24,7 +24,7 @@ RANGES |= {"gap_mm": (1.0, 500.0), "camera": (0.0, 1.0)}  # changing either of t
 
 
 async def live(socket: WebSocket, link: BrowserLink, *, protocol: str | None) -> None:
-    """Serve an authorised page on a socket not accepted yet, with any subprotocol it offered, until it disconnects."""
+    """Serve an authorised page on a socket not accepted yet, with its subprotocol, until it leaves."""
     if len(link.news) >= PAGES_MAX:
         await socket.close(1013, "too many pages are open")
         return

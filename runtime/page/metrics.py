@@ -12,8 +12,8 @@ TEXTS = ("state", "effort", "model", "scene")
 
 
 def exposition(status: Mapping[str, Any]) -> str:
-    """Format a status's numbers and known texts in the Prometheus text format. Quantiles, table entries and texts
-    become labels. Null values are skipped.
+    """Format a status's numbers and known texts in the Prometheus text format. Quantiles, table entries
+    and texts become labels. Null values are skipped.
     """
     return "".join(f"{line}\n" for line in _lines(status))
 

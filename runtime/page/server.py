@@ -62,8 +62,8 @@ class TooLong(ValueError):
 
 
 def application(daemon: DaemonClient, token: str, *, link: BrowserLink | None = None) -> Starlette:
-    """Create the web application, whose server must listen only on loopback, and whose requests need the token. `link`
-    leads to the refresh loop if the page is itself the display.
+    """Create the web application, whose server must listen only on loopback, and whose requests need the
+    token. `link` leads to the refresh loop if the page is itself the display.
     """
 
     def permitted(request: HTTPConnection) -> bool:

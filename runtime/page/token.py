@@ -17,8 +17,8 @@ MOST_BYTES = 4096  # maximum number of bytes read from the file
 
 
 def token_of(path: Path) -> str:
-    """Read the token from a file, or create it. Raises InputError if that fails, others can access it, or it is
-    invalid.
+    """Read the token from a file, or create it. Raises InputError if that fails, others can access it, or
+    it is invalid.
     """
     token, name = secrets.token_urlsafe(TOKEN_BYTES), ""
     try:

@@ -16,9 +16,9 @@ FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 def identity_card(width_px: int, height_px: int, *, title: str, lines: Sequence[str]) -> U8:
-    """Draw a (height_px, width_px, 4) test card with text, an upward arrow, colour bars and grey steps. If a line one
-    pixel wide along an edge cannot be seen, the panel is cropped or misaligned. Text is kept away from the edges,
-    because a nearby viewer sees no lit panel behind the front panel's rim.
+    """Draw a (height_px, width_px, 4) test card with text, an upward arrow, colour bars and grey steps.
+    If a line one pixel wide along an edge cannot be seen, the panel is cropped or misaligned. Text is kept away from
+    the edges, because a nearby viewer sees no lit panel behind the front panel's rim.
     """
     card = np.empty((height_px, width_px, 4), np.uint8)
     card[:] = PAPER

@@ -29,8 +29,8 @@ glfw.ERROR_REPORTING = "exception"
 
 @cache
 def gl_function(name: str) -> int:
-    """Return an OpenGL function's address, the same in all contexts, or 0. It is cached because moderngl keeps
-    references to all functions, which take 20 KiB per context.
+    """Return an OpenGL function's address, the same in all contexts, or 0. It is cached because moderngl
+    keeps references to all functions, which take 20 KiB per context.
     """
     return int(glfw.get_proc_address(name) or 0)
 
@@ -102,8 +102,8 @@ def _connect() -> None:
 
 
 class Display:
-    """Opens and closes windows on the X server, and lists the monitors. A hidden root window owns the GL objects shared
-    by all other windows. If the X server dies, the process ends (see `xlib.take_over_errors`).
+    """Opens and closes windows on the X server, and lists the monitors. A hidden root window owns the GL
+    objects shared by all other windows. If the X server dies, the process ends (see `xlib.take_over_errors`).
     """
 
     def __init__(self) -> None:
@@ -116,7 +116,7 @@ class Display:
 
     @property
     def root(self) -> Window:
-        """The hidden root window, created on first use. Raises PanelLost if the X server does not support OpenGL."""
+        """The hidden root window, created on first use. Raises PanelLost without OpenGL."""
         if not self._windows:
             _hints()
             glfw.window_hint(glfw.VISIBLE, False)
@@ -131,8 +131,9 @@ class Display:
         return in_order([monitor for monitor, _ in self._pairs()])
 
     def fullscreen_window(self, monitor: Monitor, *, title: str, opengl: bool = True) -> Window:
-        """Open a borderless window that fills a monitor; with `opengl`, make its context, shared with the root's,
-        current. Raises PanelLost if the monitor is no longer connected, or the X server does not support OpenGL.
+        """Open a borderless window that fills a monitor; with `opengl`, make its context, shared with the
+        root's, current. Raises PanelLost if the monitor is no longer connected, or the X server does not support
+        OpenGL.
         """
         share = self.root.handle if opengl else None
         handles = {connected.connector: handle for connected, handle in self._pairs()}
@@ -241,7 +242,7 @@ def x_display() -> int:
 
 
 def connected_monitors() -> tuple[Monitor, ...]:
-    """Return the active monitors, from left to right. Raises PanelLost without any, and MissingPart without X11."""
+    """Return the active monitors, left to right. Raises PanelLost without any, or MissingPart."""
     display = Display()
     try:
         monitors = display.monitors()

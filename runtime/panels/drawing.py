@@ -51,7 +51,7 @@ class PanelWindows(ABC):
 
     @abstractmethod
     def draw(self, frame: PanelFrame) -> None:
-        """Draw a frame for all panels, without showing it. Raises WindowContextLost if an OpenGL context failed."""
+        """Draw a frame for all panels, without showing it. Raises WindowContextLost."""
 
     @abstractmethod
     def show(self, clock: Clock) -> tuple[int, int]:
@@ -213,9 +213,9 @@ def open_windows(
     clock: Clock,
     on_processor: bool | None = None,
 ) -> PanelWindows:
-    """Open a fullscreen window for each panel. `on_processor` draws there if possible, or if None where OpenGL would
-    too. Raises InputError for an invalid grey curve, and PanelLost if a monitor is no longer connected or the X server
-    does not support OpenGL.
+    """Open a fullscreen window for each panel. `on_processor` draws there if possible, or if None where
+    OpenGL would too. Raises InputError for an invalid grey curve, and PanelLost if a monitor is no longer connected or
+    the X server does not support OpenGL.
     """
     mounts = [
         mount_of(panel, screen_px=monitor.size_px, layer_px=layer_px)

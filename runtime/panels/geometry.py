@@ -18,9 +18,9 @@ def panel_size_px(*, screen_width_px: int, screen_height_px: int, rotation_deg: 
 
 
 def panel_from_screen(*, screen_width_px: int, screen_height_px: int, rotation_deg: int, mirror: str) -> F64:
-    """Return the 3x3 matrix from monitor to panel pixels as seen by the viewer; v points down in both. If the mounted
-    monitor is rotated counter-clockwise by `rotation_deg`, as seen from the front, its picture is rotated clockwise to
-    make up for this. Mirroring is applied to the picture as the viewer sees it, before the rotation.
+    """Return the 3x3 matrix from monitor to panel pixels as seen by the viewer; v points down in both. If
+    the mounted monitor is rotated counter-clockwise by `rotation_deg`, as seen from the front, its picture is rotated
+    clockwise to make up for this. Mirroring is applied to the picture as the viewer sees it, before the rotation.
     """
     width, height = float(screen_width_px), float(screen_height_px)
     turned = {
@@ -51,9 +51,9 @@ def layer_from_screen(
     mirror: str,
     homography: Sequence[Sequence[float]],
 ) -> F64:
-    """Return the 3x3 matrix from monitor pixels to layer pixels, up to scale, with rotation as `panel_from_screen` has
-    it. `homography` maps ideal to actual pixels, at the panel's resolution, which may not be the layer's. Raises
-    ValueError if it is singular or not finite.
+    """Return the 3x3 matrix from monitor pixels to layer pixels, up to scale, with rotation as
+    `panel_from_screen` has it. `homography` maps ideal to actual pixels, at the panel's resolution, which may not be
+    the layer's. Raises ValueError if it is singular or not finite.
     """
     columns, rows = panel_size_px(
         screen_width_px=screen_width_px, screen_height_px=screen_height_px, rotation_deg=rotation_deg
@@ -70,7 +70,7 @@ def layer_from_screen(
 
 
 def permutes_pixels(matrix: F64) -> bool:
-    """Return True if a 3x3 matrix maps pixel centres to pixel centres, so that pictures need no interpolation."""
+    """Return True if a 3x3 matrix maps pixel centres to pixel centres: no interpolation is needed."""
     if matrix[2, 2] == 0.0:
         return False
     m = matrix / matrix[2, 2]

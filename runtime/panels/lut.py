@@ -16,9 +16,9 @@ COLUMNS = ("phase", "red", "green", "blue")
 
 
 def measured_curve(path: Path) -> F32:
-    """Read measured grey levels in [0, 1], (256, 3) by 8-bit phase and channel, from a CSV file. The columns are either
-    phase, red, green and blue, or phase and grey, with all values in [0, 1], in at least two rows of increasing phase.
-    The curve is linear between rows and constant beyond. Raises InputError, which names the fault.
+    """Read measured grey levels in [0, 1], (256, 3) by 8-bit phase and channel, from a CSV file. The
+    columns are either phase, red, green and blue, or phase and grey, with all values in [0, 1], in at least two rows of
+    increasing phase. The curve is linear between rows and constant beyond. Raises InputError, which names the fault.
     """
     text = comma_separated(untrusted_input.read_text(path))
     lines = [line for line in text.splitlines() if line.strip() and line[0] != "#"]
@@ -45,8 +45,8 @@ def measured_curve(path: Path) -> F32:
 
 
 def curve(*, lut: str, gamma: float) -> F32:
-    """Return a panel's grey levels in [0, 1], (256, 3) by 8-bit phase and channel: the file `lut`'s, or grey^gamma =
-    phase. Raises InputError if the file cannot be read or its content is invalid.
+    """Return a panel's grey levels in [0, 1], (256, 3) by 8-bit phase and channel: the file `lut`'s, or
+    grey^gamma = phase. Raises InputError if the file cannot be read or its content is invalid.
     """
     if lut:
         return measured_curve(Path(lut))

@@ -75,9 +75,9 @@ def in_order(monitors: Sequence[Monitor]) -> tuple[Monitor, ...]:
 
 
 def bind(panels: Sequence[PanelSettings], monitors: Sequence[Monitor]) -> tuple[Monitor, ...]:
-    """Find each panel's monitor by serial number, by connector, or by both if several have the same number. Raises
-    InputError if a panel's settings give neither, and PanelLost if a monitor is missing, ambiguous, already assigned or
-    mirrored on another panel's, which may be temporary.
+    """Find each panel's monitor by serial number, by connector, or by both if several have the same
+    number. Raises InputError if a panel's settings give neither, and PanelLost if a monitor is missing, ambiguous,
+    already assigned or mirrored on another panel's, which may be temporary.
     """
     ordered = in_order(monitors)
     bound: list[Monitor] = []
@@ -119,7 +119,7 @@ def _find(number: int, panel: PanelSettings, monitors: tuple[Monitor, ...]) -> M
 
 
 def check_modes(panels: Sequence[PanelSettings], monitors: Sequence[Monitor], *, width_px: int, height_px: int) -> None:
-    """Raise PanelLost if any monitor's resolution differs from the stack's: rescaling would mix neighbouring phases."""
+    """Raise PanelLost if a monitor's resolution is not the stack's: rescaling would mix phases."""
     for number, (panel, monitor) in enumerate(zip(panels, monitors, strict=True)):
         columns, rows = panel_size_px(
             screen_width_px=monitor.width_px, screen_height_px=monitor.height_px, rotation_deg=panel.rotation_deg

@@ -207,7 +207,7 @@ class FrameTextures:
 
 
 def mount_of(settings: PanelSettings, *, screen_px: tuple[int, int], layer_px: tuple[int, int]) -> Mount:
-    """Return how a monitor shows its layer. Raises InputError for its grey curve, ValueError for its homography."""
+    """Return how a monitor shows its layer. Raises InputError for its curve, ValueError for its map."""
     matrix = layer_from_screen(
         screen_width_px=screen_px[0],
         screen_height_px=screen_px[1],
@@ -225,7 +225,7 @@ def mount_of(settings: PanelSettings, *, screen_px: tuple[int, int], layer_px: t
 
 
 class Painter:
-    """Draws one panel's records using the presentation shader, in one window: contexts do not share vertex arrays."""
+    """Draws one panel's records by shader, in one window: contexts do not share vertex arrays."""
 
     def __init__(self, context: moderngl.Context, mount: Mount) -> None:
         """Compile the shader for one monitor, in its window's context."""

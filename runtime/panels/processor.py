@@ -49,8 +49,8 @@ class Axis(NamedTuple):
     offset_px: float
 
     def turned(self, line: Line, size_px: tuple[int, int]) -> Line:
-        """Turn a map from layer to picture pixels into one from monitor to turned picture's, `size_px` as seen by the
-        viewer.
+        """Turn a map from layer to picture pixels into one from monitor to turned picture's, `size_px` as
+        seen by the viewer.
         """
         scale, shift = line
         edge = 0.0 if self.sign > 0 else float(size_px[self.layer_axis])

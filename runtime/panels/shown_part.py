@@ -19,8 +19,8 @@ EVERY_PX = 2  # parts begin at even pixels, so that every other pixel is the sam
 
 
 def filled_part(shown: ShownPanel, box: PixelRect, *, rise: float = 0.0, screen_from_panel: F64 | None) -> PixelRect:
-    """Return the part of the screen that shows a box of the layer, in pixels of `shown.source`. `rise` is the largest
-    absolute relief. `screen_from_panel` is None if pixels coincide.
+    """Return the part of the screen that shows a box of the layer, in pixels of `shown.source`. `rise` is
+    the largest absolute relief. `screen_from_panel` is None if pixels coincide.
     """
     whole = PixelRect(0, 0, shown.columns, shown.rows)
     if not box.width_px or not box.height_px:
@@ -43,7 +43,7 @@ def filled_part(shown: ShownPanel, box: PixelRect, *, rise: float = 0.0, screen_
 
 
 def limit(shown: ShownPanel, part: PixelRect) -> None:
-    """Change arguments to draw only part of the screen, the same as in the whole, without the flat picture."""
+    """Change arguments to draw only part of the screen, as in the whole, without the flat picture."""
     u, v = part.u0, part.v0
     shown.screen += v * shown.screen_stride + 4 * u
     shown.columns, shown.rows = part.width_px, part.height_px

@@ -20,9 +20,9 @@ REFRESH_TOLERANCE = 1e-3  # relative tolerance when comparing refresh rates
 
 
 class PlacementWatch:
-    """Detects when a window or monitor changes. Each call to `look` checks at most one window or monitor, so that each
-    of them is checked once every `EVERY_NS`. But if the X server has refused a request since the last call, a window or
-    monitor has disappeared, and all of them are checked in the same call.
+    """Detects when a window or monitor changes. Each call to `look` checks at most one window or monitor,
+    so that each of them is checked once every `EVERY_NS`. But if the X server has refused a request since the last
+    call, a window or monitor has disappeared, and all of them are checked in the same call.
     """
 
     def __init__(self, display: Display, monitors: Sequence[Monitor], windows: Sequence[Window], clock: Clock) -> None:

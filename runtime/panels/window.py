@@ -200,8 +200,8 @@ class WindowPanels(PanelSink):
 
 
 def every_monitor() -> tuple[WindowPanels, list[U8], tuple[Monitor, ...]]:
-    """Open a window on every monitor, and return them, a test card for each, and the monitors. Raises PanelLost without
-    X, monitors or windows, and MissingPart without GLFW on X11 or OpenGL 3.3 by EGL.
+    """Open a window on every monitor, and return them, a test card for each, and the monitors. Raises
+    PanelLost without X, monitors or windows, and MissingPart without GLFW on X11 or OpenGL 3.3 by EGL.
     """
     monitors = connected_monitors()
     width, height = max(m.width_px for m in monitors), max(m.height_px for m in monitors)

@@ -143,9 +143,9 @@ _IO_ERROR_HANDLER = IOErrorHandler(_end)
 
 
 def take_over_errors() -> None:
-    """Install handlers for X errors. If the X server refuses a request, for example because a monitor has been
-    unplugged, this is only logged and counted. If the X server dies, the process logs a message and ends immediately,
-    because Xlib, EGL and GLFW would hang or crash even when asked to release objects.
+    """Install handlers for X errors. If the X server refuses a request, for example because a monitor has
+    been unplugged, this is only logged and counted. If the X server dies, the process logs a message and ends
+    immediately, because Xlib, EGL and GLFW would hang or crash even when asked to release objects.
     """
     x11 = _libraries()[0]
     x11.XSetErrorHandler(_ERROR_HANDLER)
@@ -153,8 +153,8 @@ def take_over_errors() -> None:
 
 
 class ServerWatch:
-    """Ends the process if the X server dies while the main thread is stuck in a call. Without this, if the connection
-    broke during a buffer swap, Mesa's software renderer would loop endlessly, and Xlib would not notice.
+    """Ends the process if the X server dies while the main thread is stuck in a call. Without this, if
+    the connection broke during a buffer swap, Mesa's software renderer would loop endlessly, and Xlib would not notice.
     """
 
     def __init__(self, display: int) -> None:

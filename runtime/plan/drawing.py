@@ -20,7 +20,7 @@ from runtime.support.gl import DrawnPicture
 
 
 def raster_views(eyes_m: Eyes, raster: PlaneRaster, *, reduction: int = 1) -> tuple[View, View]:
-    """Return both eyes' views, to draw content on a raster with 1/`reduction` of the panels' rows and columns."""
+    """Return both eyes' views, to draw content on a raster with 1/`reduction` of the panels' rows."""
     left, right = (
         View(eye, side, raster_from_stack(eye, raster), raster.width_px, raster.height_px, reduction)
         for side, eye in enumerate(eyes_m)
@@ -37,7 +37,7 @@ def retina_view(eye_m: F64, side: int, *, width_px: int, height_px: int, fov_deg
 def retina_pictures(
     content: ContentSource, eyes_m: Eyes, stack: PanelStack, *, fov_deg: float, time_ns: int
 ) -> tuple[U8, U8]:
-    """Draw the (h, w, 3) pictures that eyes looking at the origin should see, with as many pixels as a panel."""
+    """Draw the (h, w, 3) pictures that eyes looking at the origin should see, with a panel's pixels."""
     size = {"width_px": stack.width_px, "height_px": stack.height_px}
     views = [retina_view(eye, side, **size, fov_deg=fov_deg) for side, eye in enumerate(eyes_m)]
     content.expect(views, time_ns=time_ns)
@@ -56,7 +56,8 @@ def drawn_job(
     before: SolveWindow | None = None,
     in_depth: bool = False,
 ) -> Job:
-    """Draw content for both eyes on the middle panel's pixels, reduced, and return a job with the two pictures.
+    """Draw content for both eyes on the middle panel's pixels, reduced, and return a job with the two
+    pictures.
 
     Pictures that the content draws with OpenGL stay in textures if the model can read them. `trimmed` skips work that
     the scene does not need, even drawing outside a known extent; `before` is the previous window on this raster.

@@ -96,9 +96,9 @@ def measure(predictor: Predictor, content: ContentSource, eyes_m: Eyes, *, fov_d
 
 
 def plan_for(config: Path | None, *, scene: str | None, model: str | None, scale: float) -> dict[str, Any]:
-    """Measure a scene and return the table printed by `phasestack plan`. Scene and model replace those configured;
-    `scale` multiplies the panels' rows and columns. Raises PhasestackError if the configuration, the scene or the model
-    cannot be used.
+    """Measure a scene and return the table printed by `phasestack plan`. Scene and model replace those
+    configured; `scale` multiplies the panels' rows and columns. Raises PhasestackError if the configuration, the scene
+    or the model cannot be used.
     """
     settings = with_options(load_settings(config), scene=scene, model=model)
     cv2.setNumThreads(settings.model.threads or -1)

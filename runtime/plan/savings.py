@@ -43,15 +43,15 @@ class Plan:
 
 
 def eyes_in_range(eyes_m: Eyes, *, range_deg: float = VISIBLE_DEG) -> tuple[bool, bool]:
-    """Return, for each eye, True if it is within `range_deg` of the display's axis, seen from the display's centre."""
+    """Return, for each eye, True if it is within `range_deg` of the axis, seen from the centre."""
     off_axis = np.degrees(np.arctan2(np.linalg.norm(eyes_m[:, 1:], axis=1), eyes_m[:, 0]))
     left, right = (off_axis <= range_deg).tolist()
     return left, right
 
 
 def seeing_eyes(eyes_m: Eyes, before: tuple[bool, bool]) -> tuple[bool, bool]:
-    """Return, for each eye, True if it can see the display, given the previous result. An excluded eye must come
-    `RETURN_MARGIN_DEG` inside the range, so that noise does not switch it on and off.
+    """Return, for each eye, True if it can see the display, given the previous result. An excluded eye
+    must come `RETURN_MARGIN_DEG` inside the range, so that noise does not switch it on and off.
     """
     outer = eyes_in_range(eyes_m)
     inner = eyes_in_range(eyes_m, range_deg=VISIBLE_DEG - RETURN_MARGIN_DEG)
@@ -60,7 +60,7 @@ def seeing_eyes(eyes_m: Eyes, before: tuple[bool, bool]) -> tuple[bool, bool]:
 
 
 def selected_eyes(eyes_m: Eyes, seeing: tuple[bool, bool]) -> F64:
-    """Return the (2, 3) eyes to draw and to solve for: one that cannot see is replaced by the other, if that can."""
+    """Return the (2, 3) eyes to solve for: one that cannot see is replaced by the other, if that can."""
     if seeing == (True, False):
         return eyes_m[[0, 0]]
     if seeing == (False, True):
@@ -76,8 +76,8 @@ def make_plan(
     seeing: tuple[bool, bool] | None = None,
     measured: Measured | None = None,
 ) -> Plan:
-    """Return the plan for a scene and a viewer, valid until one of them changes. `seeing` is by default computed from
-    `eyes_m`. Items quote the `measured` effects of savings.
+    """Return the plan for a scene and a viewer, valid until one of them changes. `seeing` is by default
+    computed from `eyes_m`. Items quote the `measured` effects of savings.
     """
     on, numbers = settings.plan.enabled, measured or Measured()
     if seeing is None and eyes_m is not None:

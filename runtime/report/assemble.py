@@ -39,7 +39,7 @@ OWN = Own()
 
 
 class GrowingPage:
-    """A report that rewrites its page, report.json and plots after every result, so it can be stopped early."""
+    """A report that rewrites its files after every result, so that it can be stopped early."""
 
     def __init__(self, out: Path, command: str, progress: Progress) -> None:
         self.out, self._command, self._progress = out, command, progress
@@ -90,7 +90,8 @@ def whole_report(
     command: str = "phasestack report",
     progress: Progress = lambda name: None,
 ) -> dict[str, Any]:
-    """Run all measurements, write page, plots and report.json to a folder, and return the contents of the latter.
+    """Run all measurements, write page, plots and report.json to a folder, and return the contents of the
+    latter.
 
     Case files in `pairs`, and models, are checked before the first measurement; `own` says what else is done with them,
     and `models` are measured in addition to the shipped ones. `quick` draws built-in scenes with a quarter of the

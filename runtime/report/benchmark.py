@@ -98,7 +98,7 @@ def measured(
     sizes: Sequence[tuple[int, int]] = SIZES,
     progress: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Any]:
-    """Measure the shipped models on panels of these sizes, and return a regression file's contents. Takes a minute."""
+    """Measure the shipped models and return a regression file's contents. Takes a minute."""
     yardsticks, entries = [yardstick_ms()], []
     methods = [Method(name, "network", name) for name in models]
     for width, height in sizes:
@@ -134,8 +134,8 @@ class Change:
 
 
 def compare(old: RegressionFile, new: RegressionFile) -> list[Change]:
-    """Return the changes between two regression files that exceed the noise. Times are divided by their file's
-    yardstick before the comparison. They are not compared if the machine was too busy during either measurement
+    """Return the changes between two regression files that exceed the noise. Times are divided by their
+    file's yardstick before the comparison. They are not compared if the machine was too busy during either measurement
     (`too_busy`).
     """
     later = {entry.title: entry for entry in new.methods}

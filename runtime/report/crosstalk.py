@@ -141,17 +141,17 @@ class Patches:
 
 
 def uniformity(falloff: float) -> float:
-    """Return the lowest of nine points' luminances, divided by the highest. The points lie at 10, 50 and 90 % of the
-    width and the height. Luminance falls with the square of the distance from the middle, by `falloff` in the corners
-    (`Lighting`).
+    """Return the lowest of nine points' luminances, divided by the highest. The points lie at 10, 50 and
+    90 % of the width and the height. Luminance falls with the square of the distance from the middle, by `falloff` in
+    the corners (`Lighting`).
     """
     lights = [1 - falloff * 2 * (y * y + z * z) for y in (-0.4, 0.0, 0.4) for z in (-0.4, 0.0, 0.4)]
     return min(lights) / max(lights)
 
 
 def freedom_without_tracking(pair: StillPair, layers: U8) -> dict[str, Any]:
-    """Measure light while the head moves but the layers stay. For each direction: lists `mm` and `light_db`, and
-    `falls_3_db_at_mm`, or None if it does not fall as far.
+    """Measure light while the head moves but the layers stay. For each direction: lists `mm` and
+    `light_db`, and `falls_3_db_at_mm`, or None if it does not fall as far.
     """
     height, width = pair.images[0].shape[:2]
     sampling = LIGHT._replace(step=max(1, math.ceil(math.sqrt(height * width / 20_000))))

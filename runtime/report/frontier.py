@@ -55,7 +55,7 @@ class Method:
     iterations: int = 0  # number of SART iterations; 0 for a network
 
     def opened(self, stack: PanelStack, *, threads: int) -> Predictor:
-        """Load the method's predictor for a stack. Raises InputError for a model that does not fit, or MissingPart."""
+        """Load the method's predictor for a stack. Raises InputError if it does not fit, or MissingPart."""
         from runtime.config import ModelSettings
         from runtime.model.predictor import load_predictor
         from runtime.model.sart import SartPredictor
@@ -69,8 +69,8 @@ TIMES = "times.json"  # file with another solver's times in ms, by case
 
 
 def given_layers(folder: Path, cases: Sequence[StillPair]) -> Method:
-    """Return a method for a folder with another solver's layers: `CASE/layer-K.png` and `times.json`. Raises InputError
-    if a file is missing or unusable, or if there are no cases.
+    """Return a method for a folder with another solver's layers: `CASE/layer-K.png` and `times.json`.
+    Raises InputError if a file is missing or unusable, or if there are no cases.
     """
     if not cases:
         raise InputError(folder, "", "--layers requires --pairs with the case files that the layers were solved for")
@@ -150,7 +150,7 @@ class MethodResult:
 
     @property
     def spread_ms(self) -> tuple[float, float]:
-        """10th and 90th percentiles of the run times in ms, relative to each pair's median, scaled by `ms_p50`."""
+        """10th and 90th percentiles of the times in ms, relative to each pair's median, times `ms_p50`."""
         ratios = np.concatenate([np.asarray(pair.run_ms) / np.median(pair.run_ms) for pair in self.pairs])
         low, high = np.percentile(ratios, (10, 90))
         return float(low) * self.ms_p50, float(high) * self.ms_p50
@@ -164,9 +164,9 @@ class MethodResult:
 def measure(
     methods: Sequence[Method], pairs: Iterable[StillPair], *, threads: int = 2, viewers: Path | None = None
 ) -> Iterator[tuple[str, MethodResult]]:
-    """Yield the method, the pair and the result so far of each method on pairs of one resolution, pair by pair. Viewer
-    pages, if there is a folder for them, are written only for the first method. Raises FatalError if a measurement
-    failed or a measuring process died.
+    """Yield the method, the pair and the result so far of each method on pairs of one resolution, pair by
+    pair. Viewer pages, if there is a folder for them, are written only for the first method. Raises FatalError if a
+    measurement failed or a measuring process died.
     """
     results: dict[str, list[PairResult]] = {method.name: [] for method in methods}
     for pair in pairs:
@@ -179,7 +179,7 @@ def measure(
 
 
 def apart(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-    """Call an importable function in a new process. Raises FatalError if it dies or raises a project's error."""
+    """Call an importable function in a new process. Raises FatalError for its death or our errors."""
     # Redirect the new process's stdout to stderr, because this process's stdout may be JSON.
     with ProcessPoolExecutor(1, get_context("spawn"), initializer=os.dup2, initargs=(2, 1)) as pool:
         try:
@@ -196,7 +196,7 @@ def _called(function: Callable[..., T], args: Any, kwargs: Any) -> T:
 
 
 def run_method(method: Method, pair: StillPair, threads: int) -> MethodRun:
-    """Load, warm up and time a method on a pair, and measure the peak memory of this process, started only for that."""
+    """Load, warm up and time a method on a pair, and measure the peak memory of this new process."""
     import cv2
 
     from runtime.model.still import solve_still
@@ -224,7 +224,7 @@ def _peak_mib() -> float:
 
 
 def pair_result(pair: StillPair, run: MethodRun, *, viewer: Path | None = None) -> PairResult:
-    """Measure the layers at the pair's eyes and displaced eyes (docs/contracts.md, Error); write any viewer page."""
+    """Measure layers at the pair's eyes and displaced eyes (docs/contracts.md, Error)."""
     at_eyes = SolvedPair(run.layers, pair.images, pair.stack, pair.eyes_m, pair.fov_deg)
     off: dict[str, list[float]] = {}
     sampling = ONE_RAY._replace(step=OFF_STEP)

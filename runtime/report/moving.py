@@ -49,9 +49,10 @@ def simulated_run(
     keep_light: int = 0,
     output: Output | None = None,
 ) -> dict[str, Any]:
-    """Run against a simulated clock with a recording, measure live quality, and return the contents of summary.json.
-    `scale` multiplies the panels' rows and columns; `fixed` is the effort if `model.effort` is `full`, by default all
-    steps. The layers of every `keep_light`-th refresh, and the refreshes' records, go to `output`. Raises FatalError.
+    """Run against a simulated clock with a recording, measure live quality, and return the contents of
+    summary.json. `scale` multiplies the panels' rows and columns; `fixed` is the effort if `model.effort` is `full`, by
+    default all steps. The layers of every `keep_light`-th refresh, and the refreshes' records, go to `output`. Raises
+    FatalError.
     """
     options = RunOptions(max_speed=True, measure=True, scale=scale, fixed=fixed, keep_light=keep_light)
     with ExitStack() as cleanup:
@@ -76,8 +77,9 @@ def settings_for(recording: Path, *, scene: str, effort: str) -> Settings:
 def moving_run(
     motion: str, effort: Effort | None, *, seconds: float = SECONDS, scale: float = 0.5, seed: int = SEED
 ) -> Moving:
-    """Simulate a motion of SCENES by the viewer, or moving content in `film`, and measure what the viewer sees. Without
-    an effort, the runtime chooses. `scale` multiplies rows and columns. Raises FatalError without a measurement.
+    """Simulate a motion of SCENES by the viewer, or moving content in `film`, and measure what the viewer
+    sees. Without an effort, the runtime chooses. `scale` multiplies rows and columns. Raises FatalError without a
+    measurement.
     """
     with tempfile.TemporaryDirectory(prefix="phasestack-") as folder:
         recording = Path(folder) / "motion.mcap"

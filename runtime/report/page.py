@@ -80,7 +80,7 @@ class Page:
         return [figure for section in self.sections for figure in section.figures]
 
     def write(self, out: Path, *, data: Any, data_name: str = "report.json") -> None:
-        """Write index.html, the pictures and a JSON file of the data to a folder, all or none. Raises InputError."""
+        """Write index.html, the pictures and a JSON file of the data, all or none. Raises InputError."""
         with OutputFolder(out) as folder:
             write_json(folder.staging / data_name, data)
             write_text(folder.staging / "index.html", self.html())

@@ -117,7 +117,7 @@ def _case(path: Path, table: dict[str, Any]) -> StillPair:
 
 
 def eyes_at(*, distance_m: float, angle_deg: float = 0.0, height_m: float = 0.0, ipd_m: float = 0.063) -> F64:
-    """Return the (2, 3) eyes in `stack` of a viewer facing the origin, `angle_deg` from the x axis towards +y."""
+    """Return the (2, 3) eyes of a viewer facing the origin, `angle_deg` from the x axis towards +y."""
     angle = math.radians(angle_deg)
     level = math.sqrt(max(distance_m**2 - height_m**2, 0.0))
     middle = np.array([level * math.cos(angle), level * math.sin(angle), height_m])
@@ -126,14 +126,14 @@ def eyes_at(*, distance_m: float, angle_deg: float = 0.0, height_m: float = 0.0,
 
 
 def beside(eye_m: ArrayLike, mm: float) -> list[F64]:
-    """Return positions in `stack`, in mm along the axes of the eye's pose, to its right, above, left and below."""
+    """Return positions in `stack`, along the axes of the eye's pose, right, above, left and below."""
     pose = stack_from_eye(eye_m)
     directions = ((1, 0), (0, 1), (-1, 0), (0, -1))
     return [pose[:3, 3] + mm / 1000 * (right * pose[:3, 0] + up * pose[:3, 1]) for right, up in directions]
 
 
 class PairPainter:
-    """Painter of a scene as seen from any position: a context manager, on one thread, with an OpenGL context."""
+    """Painter of a scene as seen from any position: a context manager, on one thread, with OpenGL."""
 
     def __init__(self, scene: str | Scene, stack: PanelStack) -> None:
         """Open a scene, or a built-in scene by name, for a stack's panels. Raises MissingPart without OpenGL."""
@@ -163,7 +163,7 @@ class PairPainter:
         return np.ascontiguousarray(self.draw(eye_m, projection, width_px=width_px, height_px=height_px)[..., :3])
 
     def pair(self, name: str, eyes_m: Eyes, *, fov_deg: float = FOV_DEG, off_mm: Sequence[float] = OFF_MM) -> StillPair:
-        """Draw a pair at the panels' resolution, and targets for eyes moved right, up, left and down by `off_mm`."""
+        """Draw a pair at the panels' resolution, and targets for eyes moved to four sides by `off_mm`."""
         size = {"width_px": self.stack.width_px, "height_px": self.stack.height_px}
         left, right = (self.image(eye, **size, fov_deg=fov_deg) for eye in eyes_m)
         off = tuple(

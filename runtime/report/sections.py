@@ -17,7 +17,7 @@ NAMES = ("behind the panels", "in the middle panel", "in front of the panels")
 
 
 def frontier_section(results: Sequence[MethodResult], *, title: str, name: str) -> PageSection:
-    """Return a section with a plot, `name` its file's suffix, and a table of methods so far at one resolution."""
+    """Return a section with a plot and a table of methods so far at one resolution."""
     pairs = "; ".join(pair.pair for pair in results[0].pairs)
     text = [
         f"Every method was measured on {pairs} in one run. Quote the light PSNR, which assumes square panel pixels, "

@@ -115,8 +115,8 @@ def ideal_error(pair: StillPair, layers: U8) -> float:
 
 
 class Bench:
-    """Measures imperfections on solved pairs: the ideal panels' light plus the error that each adds. Both terms of the
-    added error use the same rays, so that a few thousand pixels suffice.
+    """Measures imperfections on solved pairs: the ideal panels' light plus the error that each adds. Both
+    terms of the added error use the same rays, so that a few thousand pixels suffice.
     """
 
     def __init__(self, subjects: Sequence[Subject]) -> None:
@@ -235,8 +235,8 @@ def _filters(choice: float, stack: PanelStack) -> RealPanels:
 
 
 def cell_choice(choice: float, count: int) -> RealPanels:
-    """Return panels of rotators (0), retarders between quarter-wave films (1), twisted nematic cells (2), half-wave
-    plates (3), or those with every other panel inverted and the analyser turned to match (4).
+    """Return panels of rotators (0), retarders between quarter-wave films (1), twisted nematic cells (2),
+    half-wave plates (3), or those with every other panel inverted and the analyser turned to match (4).
     """
     if choice == 4:
         plates = tuple(Cell("half-wave", inverted=n % 2 == 1) for n in range(count))

@@ -56,8 +56,8 @@ class ToleranceRun:
         self._begun_s = time.perf_counter()
 
     def run(self, config: Path | None, pairs: Path | None) -> dict[str, Any]:
-        """Measure everything, and return the contents of tolerance.json. Raises InputError for configuration or pairs,
-        and MissingPart if a scene must be drawn without OpenGL.
+        """Measure everything, and return the contents of tolerance.json. Raises InputError for configuration
+        or pairs, and MissingPart if a scene must be drawn without OpenGL.
         """
         self._progress("drawing the pictures")
         stack = load_settings(config).stack.stack()

@@ -34,9 +34,9 @@ class Image:
 
 
 def source(name: str, counts: Sequence[tuple[str, int]] = ()) -> str:
-    """Return a shader's source code with its included files inserted. Lines between `#for NAME` and `#end` are repeated
-    as often as `counts` has it, with `@` replaced by 0, 1 and so on, because a shader cannot choose an image by a
-    number.
+    """Return a shader's source code with its included files inserted. Lines between `#for NAME` and
+    `#end` are repeated as often as `counts` has it, with `@` replaced by 0, 1 and so on, because a shader cannot choose
+    an image by a number.
     """
 
     def read(file: str) -> str:
@@ -86,8 +86,8 @@ class Passes:
         counts: Counts = (),
         at: tuple[int, int, int, int] | None = None,
     ) -> None:
-        """Run a fragment shader for the output pixels of an area (first column and row, width, height), by default all.
-        Images and other uniforms are keyed by their names in the shader; unused ones are ignored.
+        """Run a fragment shader for the output pixels of an area (first column and row, width, height), by
+        default all. Images and other uniforms are keyed by their names in the shader; unused ones are ignored.
         """
         program, array, held = self._program(name, counts)
         for unit, (key, image) in enumerate(inputs.items()):

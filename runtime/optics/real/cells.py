@@ -30,8 +30,8 @@ Kind = Literal["rotator", "twisted-nematic", "half-wave", "variable-retarder"]
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """Liquid-crystal cell, by default the solver's ideal rotator. For other kinds, `black_deg` and `white_deg` limit
-    the angle by which the cell turns light that is polarized as the rear polarizer transmits it.
+    """Liquid-crystal cell, by default the solver's ideal rotator. For other kinds, `black_deg` and
+    `white_deg` limit the angle by which the cell turns light that is polarized as the rear polarizer transmits it.
     """
 
     kind: Kind = "rotator"
@@ -107,7 +107,7 @@ def rotator(angle_rad: ArrayLike) -> C128:
 
 
 def retarder(delta_rad: ArrayLike, axis_rad: ArrayLike) -> C128:
-    """Return the (..., 2, 2) matrices of retarders with slow axis `axis_rad` from x towards y and lag `delta_rad`."""
+    """Return matrices (..., 2, 2) of retarders with slow axis `axis_rad` from x to y and this lag."""
     delta, axis = np.broadcast_arrays(np.asarray(delta_rad, np.float64), np.asarray(axis_rad, np.float64))
     c, s = np.cos(delta / 2), np.sin(delta / 2)
     along, across = np.cos(2 * axis), np.sin(2 * axis)
@@ -116,7 +116,8 @@ def retarder(delta_rad: ArrayLike, axis_rad: ArrayLike) -> C128:
 
 
 def retarder_between_quarter_waves(angle_rad: ArrayLike, dispersion: float = 1.0) -> C128:
-    """Return the (..., 2, 2) matrices of retarders at 0° between plates of `dispersion` quarter waves at ±45°.
+    """Return the (..., 2, 2) matrices of retarders at 0° between plates of `dispersion` quarter waves at
+    ±45°.
 
     This is how a cell with vertical or parallel alignment becomes a rotator: a retardance of twice `angle_rad` turns
     any polarization by that angle, without residue where the plates are exact. The cell's own dispersion is left out
@@ -127,8 +128,8 @@ def retarder_between_quarter_waves(angle_rad: ArrayLike, dispersion: float = 1.0
 
 
 def twisted_nematic(twist_rad: ArrayLike, beta_rad: ArrayLike) -> C128:
-    """Return the (..., 2, 2) matrices of cells with a uniform twist from x towards y, and a retardance π·d·Δn/λ of
-    `beta_rad`.
+    """Return the (..., 2, 2) matrices of cells with a uniform twist from x towards y, and a retardance
+    π·d·Δn/λ of `beta_rad`.
     """
     twist, beta = np.broadcast_arrays(np.asarray(twist_rad, np.float64), np.asarray(beta_rad, np.float64))
     gamma = np.sqrt(twist**2 + beta**2)

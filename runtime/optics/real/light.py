@@ -56,9 +56,9 @@ class RealLight(NamedTuple):
 
 
 def real_light(layers: U8, stack: PanelStack, real: RealPanels, sight: Sight, sampling: RealSampling) -> RealLight:
-    """Measure layers on real panels, relative to full white, averaged over the picture in each band. Eyes and cameras
-    adapt to a darker or tinted display, but not to dark corners or moiré. Raises ValueError if an eye is not in front
-    of every panel, no pixel counts, or `real` does not fit the stack.
+    """Measure layers on real panels, relative to full white, averaged over the picture in each band. Eyes
+    and cameras adapt to a darker or tinted display, but not to dark corners or moiré. Raises ValueError if an eye is
+    not in front of every panel, no pixel counts, or `real` does not fit the stack.
     """
     real.check(stack.count)
     tables = Tables(layers, stack, real)

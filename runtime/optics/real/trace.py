@@ -37,8 +37,8 @@ class Crossings:
 def crossings(
     start_m: F64, through_m: F64, stack: PanelStack, real: RealPanels, random: np.random.Generator
 ) -> Crossings:
-    """Trace rays from points of the pupil (P, 3), through points of the assumed middle panel (P, 3), to every panel.
-    Positions are in frame `stack`. `random` is unused if no panel scatters.
+    """Trace rays from points of the pupil (P, 3), through points of the assumed middle panel (P, 3), to
+    every panel. Positions are in frame `stack`. `random` is unused if no panel scatters.
     """
     x, y, z = (np.array(part) for part in start_m.T)
     right = (through_m[:, 1] - y) / (through_m[:, 0] - x)  # dy/dx
@@ -123,8 +123,8 @@ def _diffraction_table() -> tuple[F64, F64]:
 
 
 def diffraction_orders(random: F64) -> F64:
-    """Return angles in units of wavelength/width, distributed as behind a slit (sinc², Fraunhofer), from uniform
-    numbers.
+    """Return angles in units of wavelength/width, distributed as behind a slit (sinc², Fraunhofer), from
+    uniform numbers.
     """
     return np.asarray(np.interp(random, *_diffraction_table()))
 
@@ -152,8 +152,8 @@ class Tables:
             self._full = self._full_white()
 
     def light(self, crossed: Crossings, eye_x_m: float) -> tuple[F32, F32]:
-        """Return each ray's light (P, 3), and its light through white panels, (P, 3) or (1, 1). `eye_x_m`, the eye's
-        distance from the origin, determines how the alignment moves the layers.
+        """Return each ray's light (P, 3), and its light through white panels, (P, 3) or (1, 1). `eye_x_m`,
+        the eye's distance from the origin, determines how the alignment moves the layers.
         """
         share = sum(
             (self._polarized(self._values(crossed, lags, eye_x_m)) for lags in self._moments),
@@ -232,8 +232,8 @@ class Tables:
 
 
 def black_level(cells: Sequence[Cell], polarizer_contrast: float) -> float:
-    """Return the light of crossed polarization, divided by that of parallel polarization. Half of what cells depolarize
-    passes. Polarizers pass 1/`polarizer_contrast` when crossed.
+    """Return the light of crossed polarization, divided by that of parallel polarization. Half of what
+    cells depolarize passes. Polarizers pass 1/`polarizer_contrast` when crossed.
     """
     polarized = math.prod(1.0 - cell.depolarized for cell in cells)
     leak = 0.0 if math.isinf(polarizer_contrast) else 1.0 / polarizer_contrast
@@ -255,16 +255,16 @@ class Lags:
         return self.timing.is_still
 
     def starts(self, row_share: F64) -> F64:
-        """Return when each panel updates rows (P,) at 0 (top) to 1, shape (N, P), relative to the middle row without
-        delay.
+        """Return when each panel updates rows (P,) at 0 (top) to 1, shape (N, P), relative to the middle row
+        without delay.
         """
         bottom_up = self.timing.bottom_up or (False,) * len(self.late)
         down = self.timing.scan * (row_share - 0.5)
         return np.stack([late + (-down if up else down) for late, up in zip(self.late, bottom_up, strict=True)])
 
     def of(self, index: int, row_share: F64) -> tuple[F64, F64]:
-        """Return a panel's weights of frames (frames, P), newest first, and the newest one's age (P,), at rows from 0
-        (top) to 1.
+        """Return a panel's weights of frames (frames, P), newest first, and the newest one's age (P,), at
+        rows from 0 (top) to 1.
         """
         starts = self.starts(row_share)
         start = starts[index] - starts.min(axis=0)

@@ -19,7 +19,7 @@ HALF_TURN = Rotation.from_quat([1, 2, 2, 0]).as_matrix()
 
 
 def cloud(*, aspect: float = 1.0, size_m: float = 0.3, count: int = 27) -> F64:
-    """Return random points (count, 3) in a box, `size_m` half its extent along x; y and z are `aspect` times that."""
+    """Return random points in a box, `size_m` half its extent along x; y and z are `aspect` times that."""
     return np.random.default_rng(11).uniform(-1, 1, (count, 3)) * [size_m, size_m * aspect, size_m * aspect]
 
 
@@ -31,9 +31,10 @@ def fitted(
     offset_m: tuple[float, float, float] = (0.1, -0.4, 0.3),
     turn: F64 = TURN,
 ) -> Answer:
-    """Transform points (K, 3) by a known similarity, and compare the fitted similarity with the known one. The
-    condition number is the points' largest coordinate divided by their RMS extent along the second principal axis, in
-    whichever frame is worse. Relative errors in the coordinates, including rounding, rotate the fit by this factor.
+    """Transform points (K, 3) by a known similarity, and compare the fitted similarity with the known
+    one. The condition number is the points' largest coordinate divided by their RMS extent along the second principal
+    axis, in whichever frame is worse. Relative errors in the coordinates, including rounding, rotate the fit by this
+    factor.
     """
     stack_m = scale * sensor_m @ turn.T + offset_m
     matrix = fit(sensor_m, stack_m)

@@ -54,22 +54,22 @@ def layers_of(model: str, images: Sequence[U8], eyes_m: Eyes, stack: PanelStack,
 
 
 def waves(parts: Sequence[tuple[int, float]]) -> F64:
-    """Return a sum of sine waves of different phases across a row (WIDTH_PX,), given cycles and amplitudes."""
+    """Return a sum of sine waves across a row (WIDTH_PX,), given cycles and amplitudes."""
     u = (np.arange(WIDTH_PX) + 0.5) / WIDTH_PX
     result: F64 = np.sum([size * np.sin(2 * np.pi * cycles * u + cycles - 1) for cycles, size in parts], axis=0)
     return result
 
 
 def hats(positions: F64, count: int) -> F64:
-    """Return the weights (n, count) of linear interpolation at positions (n,) between values at 0, 1, ...."""
+    """Return the weights (n, count) of linear interpolation at positions (n,) between values at 0, 1, ..."""
     weights: F64 = np.maximum(1 - np.abs(positions[:, None] - np.arange(count)), 0.0)
     return weights
 
 
 @dataclass(frozen=True)
 class StiffProblem:
-    """A problem whose targets are a common grey picture plus a difference, with a stiff part, between the eyes. Both
-    eyes look at three panels from straight ahead. The rays are traced independently of the models.
+    """A problem whose targets are a common grey picture plus a difference, with a stiff part, between the
+    eyes. Both eyes look at three panels from straight ahead. The rays are traced independently of the models.
     """
 
     gap_m: float = 0.06  # distance between neighbouring panels
@@ -92,8 +92,8 @@ class StiffProblem:
         return float((3 + abs(c)) / (3 - abs(c)))
 
     def rays(self, side: int) -> tuple[list[tuple[F64, F64]], F64]:
-        """Trace an eye's n rays that hit all panels. Return interpolation weights for each panel's rows (n, HEIGHT_PX)
-        and columns (n, WIDTH_PX), and target phases (n,).
+        """Trace an eye's n rays that hit all panels. Return interpolation weights for each panel's rows (n,
+        HEIGHT_PX) and columns (n, WIDTH_PX), and target phases (n,).
         """
         v, u = np.mgrid[0:HEIGHT_PX, 0:WIDTH_PX] + 0.5
         focal_px = WIDTH_PX * self.eye_x_m / WIDTH_M
@@ -112,8 +112,8 @@ class StiffProblem:
         return weights, np.broadcast_to(self.target(side), u.shape)[inside]
 
     def residual(self, layers: F64) -> float:
-        """Return the RMS residual of panel values (3, HEIGHT_PX, WIDTH_PX), relative to the targets' deviation from
-        1.5.
+        """Return the RMS residual of panel values (3, HEIGHT_PX, WIDTH_PX), relative to the targets'
+        deviation from 1.5.
         """
         missing, whole = 0.0, 0.0
         for weights, target in map(self.rays, (0, 1)):
@@ -191,7 +191,7 @@ def smooth(stack: PanelStack) -> list[U8]:
 def stressed(
     model: str, images: Sequence[U8], eyes_m: Eyes, stack: PanelStack = STACK, *, light: bool = False
 ) -> Answer:
-    """Measure the displayed pictures' RMS error, for light (docs/contracts.md, Error) or for one ray per pixel."""
+    """Measure the displayed pictures' RMS error, for light or for one ray per pixel."""
     layers = layers_of(model, images, eyes_m, stack)
     if layers.shape != (3, stack.height_px, stack.width_px, 3) or layers.dtype != np.uint8:
         return Answer(1.0, 0.0, note=f"layers of {layers.shape}, {layers.dtype}")
@@ -201,7 +201,7 @@ def stressed(
 
 
 def trials(*, full: bool = False) -> Iterator[Trial]:
-    """Yield all trials for the models: with `full`, all models at all poses, gaps and sizes, and 4K panels."""
+    """Yield all trials for the models: if `full`, all models at all poses, gaps and sizes, and 4K."""
     geometries: dict[str, dict[str, float]] = {
         **{f"gap {gap:g} m": {"gap_m": gap} for gap in (1e-4, 5e-3, 0.03, 0.1, 1.0)},
         **{f"eyes {ipd:g} m apart": {"ipd_m": ipd} for ipd in (1e-4, 0.005, 0.2)},

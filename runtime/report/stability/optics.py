@@ -45,8 +45,8 @@ def farthest(values: Any, reference: Any) -> float:
 
 
 def axes(eye: Any) -> Any:
-    """Return an eye pose's right, up and back axes as rows, in extended precision ((10)-(13)). For an eye on the
-    vertical axis, the result is the limit when approached from +x.
+    """Return an eye pose's right, up and back axes as rows, in extended precision ((10)-(13)). For an eye
+    on the vertical axis, the result is the limit when approached from +x.
     """
     back = eye / np.abs(eye).max()
     back = back / np.sqrt(back @ back)
@@ -105,9 +105,9 @@ def scale_shift(eye: Sequence[float], to_x_m: float) -> Answer:
 
 
 def followed(eye: Sequence[float], *, index: int = 2, stack: PanelStack = STACK) -> Answer:
-    """Compare the homography M_RPU (47) with ray tracing, at image positions whose rays cross the panel. The condition
-    number says how fast the position on the panel changes, in panel widths, for relative changes in the image position
-    or the eye's position.
+    """Compare the homography M_RPU (47) with ray tracing, at image positions whose rays cross the panel.
+    The condition number says how fast the position on the panel changes, in panel widths, for relative changes in the
+    image position or the eye's position.
     """
     view: Any = {"width_px": stack.width_px, "height_px": stack.height_px, "fov_deg": FOV_DEG}
     m = panel_from_image(image_from_stack(eye, **view), stack.panel(index))
@@ -147,7 +147,7 @@ def jones_intensity(angles_rad: Sequence[float]) -> float:
 
 
 def product(values: Sequence[float]) -> Answer:
-    """Compare sin² of the phase of panel values in [0, 1] along a ray, and Jones matrices, with the reference."""
+    """Compare sin² of the phase along a ray, and Jones matrices, with the reference."""
     truth = np.sin(PI / 2 * extended(values).sum()) ** 2
     by_sum = float(intensity_from_phase(np.array(math.fsum(values))))
     by_product = jones_intensity([value * math.pi / 2 for value in values])

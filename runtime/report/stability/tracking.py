@@ -22,7 +22,7 @@ FLOOR_M = 1e-6  # difference that may be due to another machine's rounding
 
 
 def head_m(time_ns: int, *, span_ns: int) -> F64:
-    """Return the (2, 3) eyes of a head that moves uniformly by TRAVEL_M in `span_ns`, or at most at FASTEST."""
+    """Return the (2, 3) eyes of a head that moves by TRAVEL_M in `span_ns`, or at most at FASTEST."""
     share = min(1.0, FASTEST * span_ns / NS_PER_S / float(np.linalg.norm(TRAVEL_M)))
     return EYES_M + TRAVEL_M * share * (time_ns / max(span_ns, 1))
 
@@ -39,8 +39,8 @@ def still(updates: int) -> Answer:
 
 
 def after(steps_ns: list[int], ahead_ns: int, *, lost: bool = False) -> Answer:
-    """Measure the error of eyes predicted `ahead_ns` after samples at irregular intervals. If `lost`, the last sample
-    is too old, and the tracker must return no position.
+    """Measure the error of eyes predicted `ahead_ns` after samples at irregular intervals. If `lost`, the
+    last sample is too old, and the tracker must return no position.
     """
     tracker, now_ns, span_ns = Tracker(), 0, sum(map(abs, steps_ns)) + ahead_ns
     for step_ns in (0, *steps_ns):

@@ -1,4 +1,4 @@
-"""Trials (extreme cases to run) and their outcomes (`Case`), also if the tested code raises an exception."""
+"""Trials (extreme cases to run) and their outcomes (`Case`), also if the code raises."""
 
 from __future__ import annotations
 
@@ -62,9 +62,9 @@ class Case:
 
 
 def settle(trial: Trial, *, limit: float | None = None) -> Case:
-    """Run a trial and return its outcome, given a recorded forward error, which a trial with a floor needs. A trial
-    that expects a refusal passes if the code raises one of the project's errors or a ValueError. With any other
-    exception, the trial fails.
+    """Run a trial and return its outcome, given a recorded forward error, which a trial with a floor
+    needs. A trial that expects a refusal passes if the code raises one of the project's errors or a ValueError. With
+    any other exception, the trial fails.
     """
     try:
         with warnings.catch_warnings():
