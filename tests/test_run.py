@@ -243,7 +243,7 @@ def test_real_and_simulated_time_pass_the_same_states(tmp_path: Path) -> None:
     recording = recorded(tmp_path / "loss.mcap", times, motion="still")
     config = tmp_path / "phasestack.toml"
     config.write_text(
-        f'[model]\nname = "fast"\nthreads = 1\nbackend = "opencv"\n[service]\nsocket = "{tmp_path / "status.sock"}"\n'
+        f'[model]\nname = "fast"\nthreads = 1\nbackend = "cpu"\n[service]\nsocket = "{tmp_path / "status.sock"}"\n'
     )
     common = ("run", "--config", str(config), "--replay", str(recording), "--headless", "--scale", "0.05")
     passed = {}

@@ -5,10 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from runtime.config.settings import PANELS_MOST, Settings, StackGeometry
+from runtime.config.settings import Settings, StackGeometry
 from runtime.errors import InputError
+from runtime.kernels import MAX_PANELS
 from runtime.optics.stack import PanelStack
 from runtime.support.sections import Section, read_table, validated
+
+OLD_BACKENDS = {"opencv": "cpu"}  # names that old scripts give
 
 
 def load_settings(path: Path | None) -> Settings:
@@ -27,8 +30,8 @@ def load_stack(path: Path, *, width_px: int, height_px: int) -> PanelStack:
         if name not in table:
             hint = "; in a panels file, move it from [stack] to the top level" if "stack" in table else ""
             raise InputError(path, name, f"is missing{hint}")
-    if not 2 <= len(table["x_m"] if isinstance(table["x_m"], list) else ()) <= PANELS_MOST:
-        raise InputError(path, "x_m", f"must list 2 to {PANELS_MOST} panels")
+    if not 2 <= len(table["x_m"] if isinstance(table["x_m"], list) else ()) <= MAX_PANELS:
+        raise InputError(path, "x_m", f"must list 2 to {MAX_PANELS} panels")
     return validated(StackGeometry, table, source=path).stack()
 
 
@@ -53,7 +56,7 @@ def with_options(
         ("--scene", "content", None if scene is None else {"scene": scene}),
         ("--layout", "content", None if layout is None else {"layout": layout}),
         ("--model", "model", None if model is None else {"name": model}),
-        ("--backend", "model", None if backend is None else {"backend": backend}),
+        ("--backend", "model", None if backend is None else {"backend": OLD_BACKENDS.get(backend, backend)}),
     )
     for option, section, values in overrides:
         if values is not None:

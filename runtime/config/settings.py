@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, field_validator, model_validator
+from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
 from runtime.config.paths import NameOrPath, PathText, path_in
+from runtime.kernels import MAX_PANELS
 from runtime.optics.stack import PanelStack, Tilt
 from runtime.support.plausible import nearest, within
 from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG
@@ -20,7 +21,6 @@ MOST = 1e9  # limit for numbers that have no narrower range
 PIXEL_ASPECT_TOLERANCE = 0.03  # relative; data sheets give a rounded size for the active area
 LEAST_GAP_M = 1e-5  # minimum distance between panels; real panels are all thicker
 DEPTH_MOST = 10.0  # maximum distance from the rear to the front panel, relative to the longer side of a panel
-PANELS_MOST = 8  # maximum number of panels in a stack
 
 NonNegative = Annotated[float, Field(ge=0, le=MOST)]
 Unit = Annotated[float, Field(ge=0, le=1)]
@@ -42,7 +42,7 @@ class StackGeometry(Section):
         0.2916, description="height of each panel's active area in metres"
     )
     x_m: Annotated[
-        tuple[Annotated[float, within(-10.0, 10.0, "m")], ...], Field(min_length=2, max_length=PANELS_MOST)
+        tuple[Annotated[float, within(-10.0, 10.0, "m")], ...], Field(min_length=2, max_length=MAX_PANELS)
     ] = Field((-0.06, 0.0, 0.06), description="x coordinates of the panels in metres, from rear to front")
     width_px: Annotated[int, Field(ge=16, le=16384)] = Field(1920, description="width of each panel in pixels")
     height_px: Annotated[int, Field(ge=16, le=16384)] = Field(1080, description="height of each panel in pixels")
@@ -50,12 +50,12 @@ class StackGeometry(Section):
         1.0, description="pixel width divided by pixel height (must match the sizes above to within 3%)"
     )
 
-    tilt: Annotated[tuple[tuple[Slope, Slope], ...], Field(max_length=PANELS_MOST)] = Field(
+    tilt: tuple[tuple[Slope, Slope], ...] = Field(
         (),
         description="tilt of each panel, given as the slope of x to the viewer's right and upwards, as measured by "
         "`calibrate panels` (leave empty if the panels are parallel)",
     )
-    colour: Annotated[tuple[bool, ...], Field(max_length=PANELS_MOST)] = Field(
+    colour: tuple[bool, ...] = Field(
         (),
         description="for each panel from rear to front, whether it has colour filters; a panel without them is 3 to 6 "
         "times as bright, and shows one value for all three colours (leave empty if all panels have filters)",
@@ -289,11 +289,6 @@ class ContentSettings(Section):
         return self
 
 
-def _accept_legacy_backend(name: Any) -> Any:
-    """Return a backend's current name. Old scripts use `opencv` for `cpu`."""
-    return "cpu" if name == "opencv" else name
-
-
 class ModelSettings(Section):
     """The model, and the device to run it on."""
 
@@ -308,7 +303,7 @@ class ModelSettings(Section):
     provider: Literal["cpu", "cuda", "tensorrt", "openvino"] = Field(
         "cpu", description="ONNX Runtime execution provider for the network"
     )
-    backend: Annotated[Literal["auto", "cpu", "gl"], BeforeValidator(_accept_legacy_backend)] = Field(
+    backend: Literal["auto", "cpu", "gl"] = Field(
         "auto",
         description="device for everything except the network: cpu, gl (the GPU through OpenGL) or auto for the "
         "faster of the two, as measured at startup",
@@ -358,7 +353,7 @@ class OutputSettings(Section):
         "offscreen", description="offscreen for no windows, or windows for one fullscreen window per panel"
     )
     panels: tuple[PanelSettings, ...] = Field(
-        (), max_length=PANELS_MOST, description="one table per panel, from rear to front"
+        (), max_length=MAX_PANELS, description="one table per panel, from rear to front"
     )
 
 

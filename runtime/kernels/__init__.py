@@ -14,7 +14,7 @@ from importlib import import_module
 from typing import Any
 
 INTERFACE = 1  # also in binding.cpp; raised by every change to what the compiled module offers
-MAX_PANELS = 6
+MAX_PANELS = 6  # a stack has 2 to 6
 SUBCODE = 16  # fixed-point units per 8-bit panel code
 FULL = 255 * SUBCODE  # range of a panel value, which rotates the polarization by up to a quarter turn
 EDGE_PX = 4  # maximum distance, in pixels, that an image may be sampled beyond its edge

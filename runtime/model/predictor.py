@@ -7,7 +7,7 @@ from pathlib import Path
 
 from runtime.config import ModelSettings
 from runtime.errors import InputError, MissingPart
-from runtime.kernels import MAX_PANELS, library
+from runtime.kernels import library
 from runtime.model.base import Prediction, Predictor
 from runtime.optics.stack import PanelStack
 from runtime.support.memory import keep_freed_memory
@@ -65,8 +65,6 @@ def load_predictor(name: str, stack: PanelStack, settings: ModelSettings | None 
     from runtime.model.session import ModelSession
     from runtime.model.solver import StepPredictor, steps_from_even
 
-    if stack.count > MAX_PANELS:
-        raise InputError("model", "name", f"{name} supports at most {MAX_PANELS} panels; use the model sart")
     session = ModelSession(path, provider=settings.provider, threads=settings.threads, sha256=shipped_sha256(name))
     contract = session.contract
     if name in SHIPPED and not (stack.count == 3 and stack.is_evenly_spaced):

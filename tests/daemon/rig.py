@@ -25,7 +25,7 @@ SMALL: dict[str, Any] = {
     "stack": {"width_px": 192, "height_px": 108},
     "sensor": {"driver": "fragile", "timeout_s": 0.1},
     "tracker": {"hold_s": 0.1},
-    "model": {"name": "fast", "threads": 1, "backend": "opencv"},  # auto depends on the machine's load
+    "model": {"name": "fast", "threads": 1, "backend": "cpu"},  # auto depends on the machine's load
     "loop": {"rate_hz": 200.0},
 }
 QUICK = {"sensor.worker.REOPEN_AFTER_S": 0.02, "sensor.worker.REOPEN_AFTER_MAX_S": 0.05, "frame.policy.BLEND_S": 0.02}

@@ -31,7 +31,7 @@ loop = true
 [model]
 name = "fast"
 threads = 1
-backend = "opencv"
+backend = "cpu"
 [loop]
 rate_hz = 60.0
 [service]

@@ -42,7 +42,7 @@ class Case:
 
 SMALL: dict[str, dict[str, Any]] = {
     "stack": {"width_px": 96, "height_px": 54},
-    "model": {"name": "balanced", "threads": 1, "backend": "opencv", "effort": "full"},
+    "model": {"name": "balanced", "threads": 1, "backend": "cpu", "effort": "full"},
     "loop": {"evaluate_every": 20},
 }
 

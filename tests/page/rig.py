@@ -26,7 +26,7 @@ loop = true
 [model]
 name = "fast"
 threads = 1
-backend = "opencv"
+backend = "cpu"
 [loop]
 rate_hz = 60.0
 [service]
