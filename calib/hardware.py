@@ -111,7 +111,7 @@ class SetupHardware:
             lambda: open_sensor(settings.sensor, self._clock),
             settings.sensor,
             self._clock,
-            lambda: EyeFinder(settings).find,
+            lambda: EyeFinder(settings).find_all,
         )
         worker.start()
         self._worker = worker

@@ -41,6 +41,7 @@ class Liveness:
     def begin(self) -> None:
         """Begin with another viewer."""
         self.has_lived = False  # True once the viewer has moved or blinked
+        self._first: Sign
         self._anchor: Sign | None = None
         self._anchor_ns = self._looked_ns = 0
         self._others: list[Sign] = []

@@ -114,8 +114,9 @@ class PupilFinder:
         Args:
             shares: Finder of another person whose networks to use.
         """
-        networks = None if shares is None else (shares._faces, shares._meshes, shares._irises)
-        self._faces, self._meshes, self._irises = networks or (FaceNetwork(), MeshNetwork(), IrisNetwork())
+        self._faces: FaceNetwork = shares._faces if shares else FaceNetwork()
+        self._meshes: MeshNetwork = shares._meshes if shares else MeshNetwork()
+        self._irises: IrisNetwork = shares._irises if shares else IrisNetwork()
         self._taken: Sequence[Sign] = ()
         self._flow, self._lock_ns = FaceFlow(), lock_ns
         self.viewer = self._found_count = 0
