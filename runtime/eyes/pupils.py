@@ -153,8 +153,9 @@ class PupilFinder:
         return self._looks is None
 
     def find(self, picture: U8, *, time_ns: int = 0, taken: Sequence[Sign] = ()) -> Pupils | None:
-        """Return the viewer's pupils in an RGB picture of `time_ns`, or None and store the cause in `reason`. Faces in
-        `taken` are left to other finders."""
+        """Return the viewer's pupils in an RGB picture of `time_ns`, or None and store the cause in `reason`.
+        Faces in `taken` are left to other finders.
+        """
         self._taken = taken
         if self._looks is not None and time_ns - self._seen_ns > self._lock_ns:
             self._leave()
