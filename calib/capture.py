@@ -65,7 +65,7 @@ class EyeWindow:
 
 class Walk:
     """Guide for a user who moves from viewpoint to viewpoint and accepts a pair of points at each. The
-    caller supplies samples and key presses; there are no clock and no threads here.
+    caller supplies samples and key presses; this class has neither a clock nor threads.
     """
 
     def __init__(

@@ -83,7 +83,7 @@ class SetupHardware:
     def photographs(self, settings: Settings, pictures: U8, *, panel: int | None, say: Say) -> Iterator[Named]:
         """Show (N, H, W) grey pictures without registration, wait for the user's photographs and return them.
         `panel` is the one that shows the grey chart, with no grey curve, or None for the boards. Raises InputError if
-        the user stopped or there are no readable photographs, and PanelLost.
+        the user stopped or no photograph is readable, and PanelLost.
         """
         self.let_go()
         folder = self._photos if panel is None else self._photos / f"grey-{panel}"

@@ -163,7 +163,7 @@ def registration(setup: Setup) -> Figures:
 
 
 def grey(setup: Setup) -> Figures:
-    """Step 4: measure each panel's grey curve from photographs of a chart, and save it at once."""
+    """Step 4: measure each panel's grey curve from photographs of a chart, and save each immediately."""
     stack = setup.settings.stack.stack()
     known = [bool(panel.lut) for panel in setup.settings.output.panels] or [False] * stack.count
     residuals = [0.0]

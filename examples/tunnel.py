@@ -45,7 +45,7 @@ class Tunnel(phasestack.ContentSource):
         """Draw an eye's picture by intersecting the ray through each pixel with the tube."""
         u, v = np.meshgrid(np.arange(view.width_px) + 0.5, np.arange(view.height_px) + 0.5)
         rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(view.pixels_from_stack[:, :3]).T
-        # Find t such that eye + t·ray lies on the wall. The larger of the two solutions is ahead of the eye.
+        # Find t such that eye + t·ray is on the wall. The larger of the two solutions is ahead of the eye.
         across, eye = rays[..., 1:], view.eye_m[1:]
         a, b = (across**2).sum(-1), across @ eye
         c = eye @ eye - self._options.radius_m**2

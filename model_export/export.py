@@ -114,7 +114,7 @@ def picture_network(
 ) -> tuple[Network, str]:
     """Create a picture network (name or `module:Class`) and a SHA-256 that identifies its weights. These
     are a checkpoint's, or random. `options` for the class override those in a checkpoint from `phasestack train`.
-    Raises InputError if there are no weights, or the checkpoint does not belong to this network.
+    Raises InputError without weights, or if the checkpoint does not belong to this network.
     """
     if checkpoint is None:
         if random_init is None:

@@ -33,7 +33,7 @@ SMALL = (96, 160)  # height and width of the test pictures for a model without a
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """The result of one check, with text that says what was found and what is required."""
+    """The result of one check, with a description of the finding and the requirement."""
 
     name: str
     found: str

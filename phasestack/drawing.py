@@ -120,7 +120,7 @@ class DrawingClient:
         begin("phasestack", self._run)
 
     def newest(self) -> DrawingRequest | None:
-        """Return the newest request once, or None if there is no other one since."""
+        """Return the newest request once, or None if it is not new."""
         with self._lock:
             request, self._newest = self._newest, None
         return request

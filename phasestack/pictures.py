@@ -17,7 +17,7 @@ from runtime.support.picture_file import rgb_of
 
 LEAST_PX = 16
 SLACK = 1e-3  # tolerance for rounding errors: a quarter of an 8-bit level
-OVERSHOOT = 0.3  # how far resampled values may lie outside the range, as a fraction of white
+OVERSHOOT = 0.3  # how far resampled values may be outside the range, as a fraction of white
 
 
 def as_picture(name: str, given: Any) -> Picture:
@@ -139,6 +139,6 @@ def as_codes(picture: Picture) -> U8:
 def find_eyes(picture: ArrayLike) -> Pupils | None:
     """Find the nearest viewer's pupils in a picture (h, w, 3 or 4), uint8 or floats in 0..1, or a Pillow
     image, or None. `eyes_px` (2, 2) has pixel centres at half-integers and the viewer's left eye first, which is on the
-    right unless mirrored; `sigma_px` is each coordinate's standard deviation. Raises ValueError if there is no picture.
+    right unless mirrored; `sigma_px` is each coordinate's standard deviation. Raises ValueError for anything else.
     """
     return pupils.find_eyes(as_codes(as_picture("picture", picture)))

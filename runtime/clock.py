@@ -1,4 +1,4 @@
-"""Monotonic clocks that count integer nanoseconds. Every component that needs the time is given one."""
+"""Monotonic clocks that count integer nanoseconds. Every component that needs the time gets one."""
 
 from __future__ import annotations
 

@@ -160,7 +160,7 @@ class FrameTiming:
 
     id: int  # refresh number
     wake_ns: int  # time when the presenter wakes
-    present_ns: int  # time of the vertical blank, or the end of presenting if there is none
+    present_ns: int  # time of the vertical blank, or else the end of presenting
     photon_ns: int  # middle of the display time
 
 

@@ -208,7 +208,7 @@ class Recorder(logging.Handler):
             self._fault, self._faults_ns[kind] = (at_ns, kind), at_ns
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Keep a log record. Called on whichever thread logs it."""
+        """Keep a log record. Called on any thread."""
         line = {"time_s": round(record.created, 3), "level": record.levelname.lower()}
         self._lines.append(line | {"text": text_of(record)})
         self._keep(LOG, log_message(record))
@@ -381,7 +381,7 @@ class _Journal:
         self._written: _Written | None = None
 
     def add(self, fresh: list[BlackBoxMessage], header: RecordingHeader, settings: str, *, most_ns: int) -> None:
-        """Write messages to disk at once. If this fails, the journal ends but the run continues."""
+        """Write messages to disk immediately. If this fails, the journal ends but the run continues."""
         now_ns = time.monotonic_ns()
         try:
             if self._file is None or now_ns - self._begun_ns > most_ns // 2 or self._file.tell() > BYTES_MAX // 2:
@@ -440,7 +440,7 @@ def make_room(folder: Path) -> None:
 
 
 def _number(path: Path) -> int:
-    """Return the number in a file's name, or 0 if there is none."""
+    """Return the number in a file's name, or 0."""
     first = path.name.removeprefix(".").removeprefix(PREFIX).partition("-")[0]
     return int(first) if first.isdecimal() else 0
 

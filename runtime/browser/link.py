@@ -24,7 +24,7 @@ OVERLAY_PX = 320  # width of the camera pictures sent to pages
 class SeenEyes:
     """A sample of eye positions sent by a page."""
 
-    eyes_m: Eyes | None  # (2, 3) eyes in the `stack` frame; None if there is no viewer
+    eyes_m: Eyes | None  # (2, 3) eyes in the `stack` frame; None without a viewer
     page_ms: float  # the sample's time on the page's clock
 
 
@@ -69,7 +69,7 @@ class BrowserLink:
             self._arrived.notify()
 
     def seen(self, timeout_s: float) -> list[SeenEyes]:
-        """Take all unread samples, oldest first. If there are none, wait for one for at most `timeout_s`."""
+        """Take all unread samples, oldest first. Without any, wait for one for at most `timeout_s`."""
         with self._arrived:
             if not self._samples:
                 self._arrived.wait(timeout_s)

@@ -39,7 +39,7 @@ class Row:
     name: str
     state: Verdict
     detail: str  # what was found
-    remedy: str = ""  # what the user can do; empty if there is nothing to do
+    remedy: str = ""  # a remedy for the user; or empty
 
 
 def doctor(

@@ -41,7 +41,7 @@ def run_guarded(*, interrupts_leave: bool) -> None:
             code = _code_of(app)
     except BaseException as error:
         code = _reported(error)
-    if interrupts_leave:  # on a second interrupt, exit at once
+    if interrupts_leave:  # on a second interrupt, exit immediately
         signal.signal(signal.SIGINT, lambda number, frame: os._exit(INTERRUPTED))
     code = _flushed(code)
     if _has_hung_thread():

@@ -26,7 +26,7 @@ from runtime.page.connections import LOOPBACK, listening, server_of
 from runtime.page.server import application
 
 SIZE_PX = {"width_px": 960, "height_px": 540}  # small by default, because small panels get more solutions per second
-SCENE = "room"  # scene shown if there is no configuration file
+SCENE = "room"  # scene shown without a configuration file
 WEBCAM_FOV_DEG = 65.0  # typical of webcams; can be changed in a configuration file
 SLOW_PAGE_S = 2.0  # the page's camera counts as lost if no picture arrives for this long
 

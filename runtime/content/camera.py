@@ -13,7 +13,7 @@ NEAREST_M = 1e-3  # distance from the eye to the near plane
 
 
 def clip_from_stack(view: View, *, near_m: float, far_m: float) -> F64:
-    """Return the 4x4 OpenGL clip matrix for a view. Raises ValueError if nothing is in front of the eye.
+    """Return the 4x4 OpenGL clip matrix for a view. Raises ValueError if all content is behind the eye.
     The raster's v axis is mapped to OpenGL's +y, whose rows are stored bottom first, so pictures that are read back
     need not be flipped.
     """

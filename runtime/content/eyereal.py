@@ -87,7 +87,7 @@ def read_folder(folder: Path, preset: str) -> tuple[Pair, ...]:
 
 def prepare(file: SceneFile) -> Callable[..., ContentSource]:
     """Read a folder of pairs, and return a function that creates the source. By default, the preset is
-    that whose name occurs in the folder's name. Raises InputError if there is none, or if the pairs cannot be read.
+    that whose name occurs in the folder's name. Raises InputError without one, or if the pairs cannot be read.
     """
     path, settings = file.path, file.settings
     name = file.preset or next((name for name in preset_names() if name in path.resolve().name), "")

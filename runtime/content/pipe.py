@@ -50,7 +50,7 @@ class PipeOptions(Section):
 
 
 def prepare(file: SceneFile) -> Callable[..., ContentSource]:
-    """Function that creates the source. Raises InputError if an option is invalid or there is no pipe."""
+    """Function that creates the source. Raises InputError if an option is invalid or no pipe exists."""
     options = validated(PipeOptions, file.settings.options, source="content.options")
     if options.path:
         path = Path(options.path)

@@ -77,7 +77,7 @@ class SceneFile:
 
 def guessed_axes(low: F64, high: F64) -> tuple[str, str]:
     """Guess the content's axes (up, towards the viewer) from its corners (3,): either (+y, +z) or (+z,
-    -y). Objects often stand on the ground at height 0. If only one of the y and z ranges begins near 0 or above, that
+    -y). Objects are often on the ground at height 0. If only one of the y and z ranges begins near 0 or above, that
     axis is taken to be up. Otherwise, the longer axis is.
     """
     size = np.maximum(high - low, 1e-30)

@@ -129,7 +129,7 @@ class _Form:
 class _Memory:
     """Memory that a program on the same machine can write its pictures to. A file in memory has no name, so it ends
     with the last process that uses it. The program opens it through this process's entry in /proc, which only the same
-    user can do. It cannot be made smaller, because reading beyond its end would end the process.
+    user can do. It cannot shrink, because reading beyond its end would end the process.
     """
 
     def __init__(self, size_bytes: int) -> None:

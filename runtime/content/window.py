@@ -121,7 +121,7 @@ class WindowFeed(Feed):
             self._ends.wait(AGAIN_S)
 
     def _place(self, display: str) -> Place | None:
-        """Return the window's place, or None for the whole screen. Raises ValueError if there is no such window."""
+        """Return the window's place, or None for the whole screen. Raises ValueError for an unknown window."""
         options = self._options
         if options.region is not None:
             return Place(*options.region)

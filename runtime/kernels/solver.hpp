@@ -60,7 +60,7 @@ struct Target {
   const uint8_t *row(int r) const { return r < copied ? pixels + r * stride : copies.data() + (r - copied) * bytes; }
 };
 
-// The rays of one solution: what they should see, and how much they count.
+// The rays of one solution: targets and weights.
 struct Rays {
   std::vector<Target> targets;        // for each view
   int rows, width, channels;          // size of the pictures

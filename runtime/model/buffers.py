@@ -23,7 +23,7 @@ class LayerBuffer:
 
     pixels: U8  # (N, h, w, 4) RGBA, opaque
     outside: object = None  # key for the contents outside the solved boxes; None: unknown
-    holder: Callable[[], U8 | None] = field(default=lambda: None)  # returns the view in use, or None if there is none
+    holder: Callable[[], U8 | None] = field(default=lambda: None)  # returns the view in use, or None
 
     def handed_over(self) -> U8:
         """Return a read-only view of the layers. The buffer becomes free when the view is garbage-collected."""

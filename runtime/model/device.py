@@ -57,4 +57,4 @@ class SolverBackend(Protocol):
         """Create the state for a stack. Raises InputError if the panels are too large for the device."""
 
     def close(self) -> None:
-        """Release what the states share, once these are closed. May be called more than once."""
+        """Release the states' common resources, once these are closed. May be called more than once."""

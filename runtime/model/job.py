@@ -26,10 +26,10 @@ VIEWS_MOST = 8  # maximum number of views in a job
 
 @dataclass(frozen=True, slots=True)
 class SolveWindow:
-    """A window to solve. Outside, the outer panels rest, and the middle one shows what both eyes see."""
+    """A window to solve. Outside, the outer panels rest, and the middle one shows the common picture."""
 
-    box: PixelRect  # pixels on every panel; if empty, nothing is solved
-    kept: PixelRect  # pixels inside `box` to solve on the middle panel; the others show what both eyes see
+    box: PixelRect  # pixels on every panel; may be empty
+    kept: PixelRect  # pixels inside `box` to solve on the middle panel; the others show the common picture
     taper_px: tuple[float, float]  # width (right, down) of the region where the outer panels fade to the rest value
     colour: tuple[int, ...] | None = None  # 8-bit codes of the uniform background outside; None: use the pictures
 
@@ -41,7 +41,7 @@ class Targets:
     stack: PanelStack  # the panels, with the raster to solve, which may be coarser than the display's
     # (V, 3) eye positions, frame `stack`: the first viewer's left and right eye, then the next viewer's
     eyes_m: Eyes
-    views: tuple[TargetView, ...]  # what each of these eyes should see
+    views: tuple[TargetView, ...]  # each of these eyes' target
     # Points of each pupil that have separate views; `eyes_m` and `views` list all eyes for each point in turn
     points: int = 1
 

@@ -1,6 +1,6 @@
 """A network's proposals for the outer panels, which the solver's steps start from.
 
-The network is given the difference between the eyes' pictures on a special raster (`chain`). Its rows are parallel to
+The network gets the difference between the eyes' pictures on a special raster (`chain`). Its rows are parallel to
 the line through the eyes, and the parallax is a whole number of columns. The network returns both outer panels on the
 same raster.
 """

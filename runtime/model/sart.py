@@ -1,7 +1,7 @@
 """SART (simultaneous algebraic reconstruction technique) on one branch of Malus' law, for comparison.
 
 The technique (Andersen and Kak 1984) is the published solver for polarization fields (Lanman et al. 2011). This
-implementation supports any number of panels and views. Each iteration corrects all panels at once, by equal
+implementation supports any number of panels and views. Each iteration corrects all panels together, by equal
 shares of all views' residual phases. A panel without colour filters gets the mean correction of the three channels. The
 relaxation factor is the best value found by trial and error.
 """

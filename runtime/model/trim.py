@@ -4,7 +4,7 @@ A window of the panels is equivalent to a smaller stack with its origin at the w
 accordingly. Outside the window, the outer panels have the rest value, and the centre panel shows the picture. To avoid
 a visible seam, the outer panels' values are tapered to the rest value at the window's edge (`Geometry.tapers`).
 
-The previous solution's window, `before`, is kept if it still fits. There is None instead of a window if solving the
+The previous solution's window, `before`, is kept if it still fits. The window is None if solving the
 whole panel would be as fast.
 """
 

@@ -75,16 +75,16 @@ class Mount:
 
     screen_px: tuple[int, int]  # width and height
     layer_from_screen: F64  # 3x3 homography of pixels; the third coordinate is positive at the monitor's centre
-    is_exact: bool  # True if the monitor's pixel centres coincide with the layer's, so that nothing is interpolated
+    is_exact: bool  # True if the monitor's pixel centres coincide with the layer's, so that no pixel is interpolated
     curve: F32 | None = None  # (256, 3) grey level in 0..1 by code and channel, linear in between; None: the identity
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PanelDraw:
-    """Record of what one panel shows for a frame. Pixels of layers count from their corners."""
+    """Record of one panel's picture for a frame. Pixels of layers count from their corners."""
 
     size_px: tuple[int, int]  # the panel's columns and rows
-    solved_px: tuple[int, int]  # the solution's; the panel's if there is no solution
+    solved_px: tuple[int, int]  # the solution's; the panel's without a solution
     rest: int  # code outside the solution
     extended_px: int  # pixels by which the solution's edge is repeated, 0 or 1
     flatness: float  # weight of the flat picture; 1: the solution is not read, 0: the flat picture is not

@@ -49,7 +49,7 @@ def relief_of(nearness: Sequence[F32], *, distance_m: Sequence[float], rim_px: i
 
 def parallax(stack: PanelStack, *, old_m: F64, new_m: F64) -> Parallax | None:
     """Return how the content moves when the midpoint between the eyes moves from `old_m` to `new_m`, in
-    frame `stack`. None if it has not moved, or if there is no middle panel (an even number of panels).
+    frame `stack`. None if it has not moved, or if the number of panels is even.
     """
     if stack.count % 2 == 0 or np.array_equal(old_m, new_m):
         return None

@@ -1,6 +1,6 @@
 """Homographies that correct the layers of tilted panels for an eye's position.
 
-For each panel, there is an ideal panel, which is parallel to the others and lies at the nominal x_m. Registration from
+For each panel, there is an ideal panel, which is parallel to the others and at the nominal x_m. Registration from
 photographs maps every layer pixel to the point where an eye at `seen_from_m` sees it on the ideal panel. Seen from
 anywhere else, including the other eye's position, the pixels of a tilted panel appear displaced.
 

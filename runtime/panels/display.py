@@ -42,7 +42,7 @@ class WindowContext:
         self._window = window
 
     def load_opengl_function(self, name: str) -> int:
-        """Return an OpenGL function's address, or 0 if there is no such function."""
+        """Return an OpenGL function's address, or 0."""
         return gl_function(name)
 
     load = load_opengl_function

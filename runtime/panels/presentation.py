@@ -156,7 +156,7 @@ class FrameTextures:
         )
 
     def upload(self, frame: PanelFrame) -> None:
-        """Upload whichever pictures are visible in a frame and have not been uploaded yet."""
+        """Upload all pictures that are visible in a frame and have not been uploaded yet."""
         lacks_solved, lacks_flat = self.lacks(frame)
         if lacks_solved and frame.solved is not None:
             self._solved_version = None  # stays None if the upload fails

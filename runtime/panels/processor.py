@@ -109,7 +109,7 @@ class _Pictures:
 
 
 class _PictureMemory:
-    """Memory for a picture of any size for each panel, filled at once, because first use is slow."""
+    """Memory for a picture of any size for each panel, filled when created, because first use is slow."""
 
     def __init__(self, mountings: Sequence[Mounting]) -> None:
         self._rest = min(rest_code(len(mountings)), 255)

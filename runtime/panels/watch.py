@@ -26,7 +26,7 @@ class PlacementWatch:
     """
 
     def __init__(self, display: Display, monitors: Sequence[Monitor], windows: Sequence[Window], clock: Clock) -> None:
-        """Start watching. The first query is made after `EVERY_NS`."""
+        """Start watching. The first query follows after `EVERY_NS`."""
         self._display, self._clock = display, clock
         # Only the EDID is used from each of these. Positions and modes are compared with those in `monitors`.
         self._states = [display.output_state(monitor.connector) for monitor in monitors]

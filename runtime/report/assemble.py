@@ -64,7 +64,7 @@ class GrowingPage:
         self.write()
 
     def write(self) -> None:
-        """Write all results measured so far. Raises InputError if the files cannot be written."""
+        """Write all results. Raises InputError if the files cannot be written."""
         doing = self.record.get("measuring")
         notes = (
             [f"This report is not finished; results are added as they come in. Last known step: {doing}."]

@@ -30,7 +30,7 @@ SCATTERS = 3.0  # a difference between times must exceed this many standard erro
 
 
 class BenchEntry(BaseModel):
-    """One method's results at one panel size, limited to what a comparison needs."""
+    """One method's results at one panel size, as a comparison needs them."""
 
     name: str
     width_px: int
@@ -48,7 +48,7 @@ class BenchEntry(BaseModel):
 
 
 class RegressionFile(BaseModel):
-    """A regression file's contents, limited to what a comparison needs."""
+    """A regression file's contents, as a comparison needs them."""
 
     version: Literal[2]
     yardstick_ms: PositiveFloat

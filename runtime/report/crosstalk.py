@@ -128,7 +128,7 @@ class Patches:
         return picture
 
     def _mean(self, side: int, layers: U8, region: Rectangle) -> float:
-        """Return what an eye sees, averaged over the inner part of a region."""
+        """Return an eye's view, averaged over the inner part of a region."""
         left, right, bottom, top = region
         y, z = (left + right) / 2, (bottom + top) / 2
         half = (right - left) / 2 * INNER, (top - bottom) / 2 * INNER
@@ -141,7 +141,7 @@ class Patches:
 
 
 def uniformity(falloff: float) -> float:
-    """Return the lowest of nine points' luminances, divided by the highest. The points lie at 10, 50 and
+    """Return the lowest of nine points' luminances, divided by the highest. The points are at 10, 50 and
     90 % of the width and the height. Luminance falls with the square of the distance from the middle, by `falloff` in
     the corners (`Lighting`).
     """

@@ -70,7 +70,7 @@ TIMES = "times.json"  # file with another solver's times in ms, by case
 
 def given_layers(folder: Path, cases: Sequence[StillPair]) -> Method:
     """Return a method for a folder with another solver's layers: `CASE/layer-K.png` and `times.json`.
-    Raises InputError if a file is missing or unusable, or if there are no cases.
+    Raises InputError if a file is missing or unusable, or without cases.
     """
     if not cases:
         raise InputError(folder, "", "--layers requires --pairs with the case files that the layers were solved for")

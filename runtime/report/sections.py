@@ -101,7 +101,7 @@ def method_table(results: Sequence[MethodResult]) -> Table:
 
 
 def moving_section(found: Sequence[Moving]) -> PageSection:
-    """Return a section with the live quality and view error for each motion and effort measured so far."""
+    """Return a section with the live quality and view error for each motion and effort measured."""
     costs = ", ".join(f"{stage} {ms}" for stage, ms in COSTS_MS.items())
     text = [
         "A solution takes longer than a refresh, and the head keeps moving. At every refresh, the outer panels are "

@@ -40,7 +40,7 @@ class Imperfection:
     sizes: tuple[float, ...]  # the first is that of ideal panels
     assumed: float  # size in the build as ordered and mounted by hand
     left: float  # size that is left after `remedy`
-    remedy: str  # what reduces it from `assumed` to `left`, empty if nothing does
+    remedy: str  # what reduces it from `assumed` to `left`, or empty
     make: Make  # panels with this imperfection alone
     note: str = ""
     make_left: Make | None = None  # panels after the remedy, of the size `assumed`; None: those of the size `left`
@@ -209,7 +209,7 @@ def _shift(size: float, stack: PanelStack) -> RealPanels:
 
 def _apparent_gaps(mm: float, stack: PanelStack) -> RealPanels:
     """Panels whose layers appear, through the glass and from the front, where the solver assumes them."""
-    nearer = mm * (1 - 1 / Optics().index)  # how much nearer a layer of glass makes what is behind it
+    nearer = mm * (1 - 1 / Optics().index)  # how much nearer things behind a layer of glass appear
     depths = [-nearer * (1 + 2 * (stack.count - 1 - n)) for n in range(stack.count)]
     return RealPanels(placement=tuple(Placement(depth_mm=depth) for depth in depths), optics=Optics(glass_mm=mm))
 

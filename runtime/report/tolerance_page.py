@@ -47,7 +47,7 @@ NOTE = (
 
 
 class ToleranceRun:
-    """A run's results so far. Every new part is written to the folder, if there is one."""
+    """A run's results. Every new part is written to the folder, if there is one."""
 
     def __init__(self, out: Path | None, command: str, progress: Progress) -> None:
         self._out, self._command, self._progress = out, command, progress

@@ -1,4 +1,4 @@
-// A list of what can be chosen, with a text field for anything else.
+// A list of choices, with a text field for anything else.
 const OTHER = "\u2026"; // value of the entry that opens the text field
 
 export class Choice {
@@ -12,7 +12,7 @@ export class Choice {
     });
   }
 
-  // Show groups of entries: [title, [[value, text], ...]]. A group without a title stands by itself.
+  // Show groups of entries: [title, [[value, text], ...]]. A group may have no title.
   offer(groups) {
     const key = JSON.stringify(groups), chosen = this.value;
     if (key === this.key) return;
@@ -64,7 +64,7 @@ export function effortInWords(name) {
   return `${steps} ${steps === "1" ? "step" : "steps"} on ${raster ?? `1/${reduction} of the rows and columns`}`;
 }
 
-// What can be shown besides the scenes in the list.
+// Scenes besides those in the list.
 export const MORE = `<details class="others"><summary>What else can be shown</summary><ul>
 <li>A file or folder on the display's PC: stereo pictures and films, 3D models, Gaussian splats, data sets of views, pictures with depth, playlists.</li>
 <li>All files in a folder: set <code>content.library</code> in the configuration, and this list contains them.</li>

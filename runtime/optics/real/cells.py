@@ -1,7 +1,7 @@
 """Jones matrices of liquid-crystal cells, for each panel value and wavelength band.
 
 A Jones matrix acts on the column vector (E_x, E_y) of light that travels from the backlight to the viewer. The rear
-polarizer transmits x. A cell absorbs nothing, so its matrix is unitary. Common phase factors are left out.
+polarizer transmits x. A cell absorbs nothing, so its matrix is unitary. Common phase factors are omitted.
 
 Sources: twisted nematic cells, Gooch and Tarry, J. Phys. D 8 (1975) 1575; with a voltage applied, Lu and Saleh, Opt.
 Eng. 29 (1990) 240: the twist stays linear while the tilt of the molecules reduces the birefringence.
@@ -20,7 +20,7 @@ from runtime.records import F64
 
 C128 = NDArray[np.complex128]
 BANDS_NM = (610.0, 540.0, 460.0)  # dominant wavelengths of the red, green and blue bands
-DESIGN_NM = 540.0  # wavelength that cells are made for
+DESIGN_NM = 540.0  # the cells' design wavelength
 FIRST_MINIMUM = math.sqrt(3.0)  # Mauguin parameter of the first Gooch-Tarry minimum
 STEPS = 4  # entries of a table per 8-bit code
 

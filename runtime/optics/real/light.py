@@ -88,7 +88,7 @@ def real_light(layers: U8, stack: PanelStack, real: RealPanels, sight: Sight, sa
 
 
 def _moves(sight: Sight) -> Iterator[tuple[float, F64]]:
-    """Return the weights and displacements (3,) of five eye positions that stand for the tracking error."""
+    """Return the weights and displacements (3,) of five eye positions that represent the tracking error."""
     yield (0.5 if sight.sigma_mm else 1.0), np.zeros(3)
     if sight.sigma_mm:
         right = stack_from_eye(sight.eyes_m.mean(axis=0))[:3, 0]
@@ -106,7 +106,7 @@ class _Eye(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _View:
-    """Light that an eye sees at the sampled pixels. Pixels that do not count have been left out."""
+    """Light that an eye sees at the sampled pixels. Only pixels that count are included."""
 
     light: F32  # (sets, P, 3)
     white: F32  # (sets, P, 3) what it would see of white panels

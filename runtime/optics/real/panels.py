@@ -72,7 +72,7 @@ class Timing:
 
     @property
     def is_still(self) -> bool:
-        """True if nothing depends on time."""
+        """True if time has no effect."""
         return self.head_m_s == 0.0 or (self.response_ms == 0.0 and self.scan == 0.0 and not any(self.late_ms))
 
 

@@ -279,7 +279,7 @@ class Lags:
 
 
 def moments(stack: PanelStack, timing: Timing) -> list[Lags]:
-    """Return the panels' states at moments of a refresh, or one state if nothing depends on time."""
+    """Return the panels' states at moments of a refresh, or one state if time has no effect."""
     late = tuple(ms * timing.rate_hz / 1e3 for ms in timing.late_ms) or (0.0,) * stack.count
     places = [0.0] if timing.is_still else (np.arange(MOMENTS) + 0.5) / MOMENTS
     return [Lags(float(place), timing, late) for place in places]
