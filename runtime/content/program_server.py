@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import fcntl
 import hmac
+import io
 import json
 import logging
 import mmap
@@ -26,7 +27,9 @@ from functools import partial
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
+import cv2
 import numpy as np
+from PIL import Image
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 
@@ -55,6 +58,7 @@ DEPTHS: dict[str, np.dtype[Any]] = {
     "uint16": np.dtype("<u2"),
     "float32": np.dtype("<f4"),
 }  # pixel types of depth pictures
+ENCODINGS = ("raw", "jpeg")
 SLOTS = 4  # frames in shared memory: two in flight, the newest, and the one that the solver still reads
 MESSAGE_MAX_BYTES = 8 * 7680 * 4320 + HEAD.size
 WRONG_DATA, LEAVING, TOO_BIG = 1007, 1001, 1009  # close codes of RFC 6455
@@ -99,6 +103,11 @@ class _Form:
     height_px: int
     depth: np.dtype[Any] | None
     bottom_up: bool
+    encoding: str = "raw"
+
+    @property
+    def depth_bytes(self) -> int:
+        return 0 if self.depth is None else self.depth.itemsize * self.width_px * self.height_px
 
     @property
     def pixels_bytes(self) -> int:
@@ -106,24 +115,50 @@ class _Form:
 
     @property
     def bytes(self) -> int:
-        depth_bytes = 0 if self.depth is None else self.depth.itemsize
-        return (4 + depth_bytes) * self.width_px * self.height_px
+        return self.pixels_bytes + self.depth_bytes
+
+    def received(self, data: memoryview) -> ProgramPicture:
+        """Return the picture in a message. Raises ValueError if it has the wrong size or encoding."""
+        if self.encoding == "raw":
+            return self.picture(data)
+        end = max(len(data) - self.depth_bytes, 0)
+        pixels = decoded_jpeg(bytes(data[:end]), self.width_px, self.height_px)
+        return ProgramPicture(pixels[:: self._order], self._depth_in(data[end:]))
 
     def picture(self, data: memoryview) -> ProgramPicture:
-        """Return the picture in a message or in shared memory, uncopied. Raises ValueError if the data has
-        the wrong size.
+        """Return the raw picture in a message or in shared memory, without copying it.
+
+        Raises ValueError if the data has the wrong size.
         """
         if len(data) != self.bytes:
             parts = "RGBA pixels" if self.depth is None else f"RGBA pixels and {self.depth.name} depths"
             raise ValueError(f"the answer has {len(data)} bytes, which is not {self.width_px}x{self.height_px} {parts}")
-        order = -1 if self.bottom_up else 1
-        rows, columns = self.height_px, self.width_px
-        pixels = np.frombuffer(data[: self.pixels_bytes], np.uint8).reshape(rows, columns, 4)[::order]
+        pixels = np.frombuffer(data[: self.pixels_bytes], np.uint8).reshape(self.height_px, self.width_px, 4)
+        return ProgramPicture(pixels[:: self._order], self._depth_in(data[self.pixels_bytes :]))
+
+    @property
+    def _order(self) -> int:
+        return -1 if self.bottom_up else 1
+
+    def _depth_in(self, data: memoryview) -> F32 | U16 | None:
         if self.depth is None:
-            return ProgramPicture(pixels, None)
-        return ProgramPicture(
-            pixels, np.frombuffer(data[self.pixels_bytes :], self.depth).reshape(rows, columns)[::order]
-        )
+            return None
+        return np.frombuffer(data, self.depth).reshape(self.height_px, self.width_px)[:: self._order]
+
+
+def decoded_jpeg(data: bytes, width_px: int, height_px: int) -> U8:
+    """Return the RGBA pixels (h, w, 4) of a JPEG. Raises ValueError if it is invalid or has another size."""
+    try:
+        with Image.open(io.BytesIO(data), formats=["JPEG"]) as header:
+            size = header.size
+    except (OSError, ValueError):
+        raise ValueError("the answer is not a JPEG picture") from None
+    if size != (width_px, height_px):
+        raise ValueError(f"the answer is a picture of {size[0]}x{size[1]} pixels, not {width_px}x{height_px}")
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    if pixels is None:
+        raise ValueError("the answer is not a JPEG picture")
+    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGBA), np.uint8)
 
 
 class _Memory:
@@ -195,6 +230,9 @@ class _Client:
             raise ValueError(f"scale must be a number from {SCALE_MIN} to 1")
         if depth is not None and depth not in tuple(DEPTHS):
             raise ValueError(f"depth must be {' or '.join(DEPTHS)}")
+        self._encoding = hello.get("encoding", "raw")
+        if self._encoding not in ENCODINGS:
+            raise ValueError(f"encoding must be {' or '.join(ENCODINGS)}")
         self._scale = scale
         self._depth: np.dtype[Any] | None = None if depth is None else DEPTHS[depth]
         self._shares_memory, self._frames_shared = bool(hello.get("memory")), 0
@@ -205,7 +243,7 @@ class _Client:
     def form(self, asked: AskedViews) -> _Form:
         """Return the size and parts of the pictures for a request."""
         width_px, height_px = (max(1, round(size * self._scale)) for size in (asked.width_px, asked.height_px))
-        return _Form(width_px, height_px, self._depth, self.bottom_up)
+        return _Form(width_px, height_px, self._depth, self.bottom_up, self._encoding)
 
     def request(self, number: int, frame: _Frame) -> None:
         """Leave a request for the program and, if it uses shared memory, choose the places of the pictures."""
@@ -447,7 +485,8 @@ class ProgramServer:
             if client is not self._drawing or frame is None or side not in frame.asked.sides:
                 return  # the frame was abandoned
         data = memoryview(message)[HEAD.size :]
-        frame.pictures[side] = frame.form.picture(frame.places[side] if not data and side in frame.places else data)
+        in_memory = not data and side in frame.places
+        frame.pictures[side] = frame.form.picture(frame.places[side]) if in_memory else frame.form.received(data)
         if len(frame.pictures) == len(frame.asked.eyes):
             self._complete(number, frame)
 

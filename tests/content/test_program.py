@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import re
@@ -25,6 +26,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
+from PIL import Image
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
@@ -335,6 +337,54 @@ def test_a_program_may_draw_smaller_pictures(source: Any) -> None:
     program.end()
 
 
+def jpeg_of(asked: dict, eye: dict) -> bytes:
+    """Red encodes the eye in the upper half; the lower half is black."""
+    picture = np.zeros((asked["height"], asked["width"], 3), np.uint8)
+    picture[: asked["height"] // 2, :, 0] = 200 if eye["eye"] == "left" else 100
+    coded = io.BytesIO()
+    Image.fromarray(picture).save(coded, "JPEG", quality=95)
+    return coded.getvalue()
+
+
+def test_pictures_may_be_encoded_as_jpeg(source: Any) -> None:
+    program = Program(source, jpeg_of, encoding="jpeg")
+    for picture, red in zip(drawn(source), (200, 100)):
+        assert np.abs(picture[2:14].astype(int) - [red, 0, 0]).max() < 8 and picture[22:].max() < 8
+    program.end()
+
+
+def test_a_jpeg_may_be_followed_by_depth(source: Any) -> None:
+    depth = np.zeros((36, 64), "<u2")
+    depth[18:] = 65535
+    program = Program(
+        source,
+        lambda asked, eye: jpeg_of(asked, eye) + depth.tobytes(),
+        encoding="jpeg",
+        depth="uint16",
+        rows="bottom-up",
+    )
+    view = raster_views(EYES, STACK.panel(0))[0]
+    assert source.render(view, time_ns=0)[20:34, :, 0].min() > 190
+    nearness = source.nearness(view, every=4, first=(0, 0))
+    assert (nearness[:4] == 0).all() and (nearness[5:] > 1).all()
+    program.end()
+
+
+@pytest.mark.parametrize(
+    ("answer", "why"),
+    [
+        (b"x" * 100, "the answer is not a JPEG picture"),
+        (jpeg_of({"width": 32, "height": 18}, {"eye": "left"}), "the answer is a picture of 32x18 pixels, not 64x36"),
+        (jpeg_of({"width": 64, "height": 36}, {"eye": "left"})[:-200], "the answer is not a JPEG picture"),
+    ],
+)
+def test_a_wrong_jpeg_is_answered_with_the_reason(source: Any, answer: bytes, why: str) -> None:
+    program = Program(source, lambda asked, eye: answer, encoding="jpeg")
+    with pytest.raises(ContentFailure, match=why):
+        drawn(source)
+    assert program.ended.wait(10)
+
+
 def plane_and_background(asked: dict, eye: dict, dtype: str) -> bytes:
     """The panels' plane x = 0 in front of the background, at the left; rows at the top are nearer by 0.2 m."""
     width, height = asked["width"], asked["height"]
@@ -436,7 +486,11 @@ def test_a_program_that_cannot_open_the_memory_sends_its_pictures(source: Any) -
 
 @pytest.mark.parametrize(
     ("hello", "why"),
-    [({"scale": 0}, "scale must be a number from 0.1 to 1"), ({"depth": "int8"}, "depth must be uint16 or float32")],
+    [
+        ({"scale": 0}, "scale must be a number from 0.1 to 1"),
+        ({"depth": "int8"}, "depth must be uint16 or float32"),
+        ({"encoding": "png"}, "encoding must be raw or jpeg"),
+    ],
 )
 def test_a_wrong_greeting_is_answered_with_the_reason(source: Any, hello: dict, why: str) -> None:
     with connect(source.program["address"]) as socket:
