@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 import subprocess
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,6 @@ from calib.solve_run import solve_file
 from runtime.config import Settings, load_settings
 from runtime.errors import InputError
 from runtime.panels.geometry import Arrow, mounting_of
-from runtime.panels.monitors import Monitor
 from runtime.sensor.registry import DRIVERS
 from runtime.support import untrusted_input
 from runtime.support.artifacts import OutputFolder, write_bytes, write_text
@@ -102,16 +101,10 @@ def identify(setup: Setup) -> Figures:
         arrow = ask("Seen from the front, which way does the arrow point?", "arrow keys", ARROWS)
         readable = ask("Can you read the text, or is it mirrored?", "Enter: readable, n: mirrored", YES_NO)
         rotation_deg, mirror = mounting_of(arrow, mirrored=not readable)
-        name = _name_of(monitors[free.pop(0)], monitors)
-        tables.append(name | {"rotation_deg": rotation_deg, "mirror": mirror})
+        selection = monitors[free.pop(0)].selection(monitors)
+        tables.append(selection | {"rotation_deg": rotation_deg, "mirror": mirror})
     rewrite(setup.config, lambda document: put_monitors(document, tables))
     return {"text": f"assigned {count} panels to their monitors"}
-
-
-def _name_of(monitor: Monitor, monitors: Sequence[Monitor]) -> dict[str, Any]:
-    """Return the settings that identify a monitor: its serial number if unique, otherwise its connector."""
-    alone = [m.serial for m in monitors].count(monitor.serial) == 1
-    return {"edid_serial": monitor.serial} if monitor.serial and alone else {"connector": monitor.connector}
 
 
 def geometry(setup: Setup) -> Figures:

@@ -62,6 +62,13 @@ PANEL = '[[output.panels]]\nconnector = "DP-{}"\n'
         ("[stack]\ntilt = [[0, 0], [0, true], [0, 0]]", "stack.tilt.1.1", "valid number"),
         ("[loop]\nsimulated_stage_ms = { render = true }", "loop.simulated_stage_ms.render", "valid number"),
         ('[model]\neye_sigma_mm = "foo"', "model.eye_sigma_mm", "'auto' or a valid number"),
+        ("loop = 60", "loop", "Input should be a table"),
+        ("[output.panels]\nconnector = 'DP-1'", "output.panels", "Input should be a list in brackets"),
+        ("[[output.panels]]\nedid_serial = 12345", "output.panels.0.edid_serial", "Input should be text in quotes"),
+        ("[plan]\nenabled = 'maybe'", "plan.enabled", "Input should be true or false"),
+        ("[stack]\nwidth_px = 'wide'", "stack.width_px", "Input should be a whole number"),
+        ("[stack]\nx_m = [0]", "stack.x_m", "must have at least 2 items"),
+        ("[stack]\nx_m = [0, 1, 2, 3, 4, 5, 6, 7, 8]", "stack.x_m", "must have at most 8 items"),
         (
             '[content]\nlayout = "foo"',
             "content.layout",
@@ -89,6 +96,16 @@ def test_no_name_or_path_holds_what_a_file_system_can_not(
 ) -> None:
     with pytest.raises(InputError, match=rf"phasestack\.toml: {section}\.{key}: .*{said}"):
         loaded(tmp_path, f"[{section}]\n{key} = {value}")
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_a_file_saved_by_a_windows_editor_is_read(tmp_path: Path, encoding: str) -> None:
+    file = tmp_path / "phasestack.toml"
+    file.write_bytes('[content]\r\nscene = "Gärten"\r\n'.encode(encoding))
+    assert load_settings(file).content.scene == "Gärten"
+    file.write_bytes(file.read_bytes() + b"\xff")
+    with pytest.raises(InputError, match="is not valid UTF-"):
+        load_settings(file)
 
 
 def test_pixels_that_are_not_square_need_to_be_told(tmp_path: Path) -> None:

@@ -44,7 +44,7 @@ def identify(
         else:
             panels, cards, monitors = every_monitor()
             for monitor in monitors:
-                typer.echo(f"{monitor}: [[output.panels]] {monitor.setting}")
+                typer.echo(f"{monitor}: [[output.panels]] {monitor.setting(monitors)}")
     except PanelLost as error:
         raise InputError("output", "panels", str(error)) from None
     keys = TerminalKeys(quit_at_end=False)

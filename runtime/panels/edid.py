@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 HEADER = b"\x00\xff\xff\xff\xff\xff\xff\x00"
@@ -39,5 +40,7 @@ def _text(block: bytes, tag: int) -> str:
     for start in DESCRIPTORS:
         descriptor = block[start : start + 18]
         if descriptor[:3] == b"\x00\x00\x00" and descriptor[3] == tag:
-            return descriptor[5:18].split(b"\n")[0].decode("cp437").strip()
+            # Ends with a line feed by the standard, and with zeros in many monitors.
+            text = re.split(rb"[\n\0]", descriptor[5:18])[0].decode("cp437")
+            return "".join(filter(str.isprintable, text)).strip()
     return ""

@@ -5,9 +5,10 @@ Monitors are never guessed. Pictures are never rescaled, because the phases must
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from runtime.config import PanelSettings
 from runtime.errors import InputError, PanelLost
@@ -58,10 +59,17 @@ class Monitor:
         """Width and height."""
         return self.width_px, self.height_px
 
-    @property
-    def setting(self) -> str:
-        """Configuration line that selects this monitor in `[[output.panels]]`."""
-        return f'edid_serial = "{self.serial}"' if self.serial else f'connector = "{self.connector}"'
+    def selection(self, monitors: Sequence[Monitor]) -> dict[str, Any]:
+        """Return the setting in `[[output.panels]]` that selects this one of the monitors: its serial number if unique,
+        otherwise its connector.
+        """
+        is_unique = [monitor.serial for monitor in monitors].count(self.serial) == 1
+        return {"edid_serial": self.serial} if self.serial and is_unique else {"connector": self.connector}
+
+    def setting(self, monitors: Sequence[Monitor]) -> str:
+        """Return the `selection` as a line of a configuration."""
+        ((name, value),) = self.selection(monitors).items()
+        return f"{name} = {json.dumps(value, ensure_ascii=False)}"  # a string of JSON is also one of TOML
 
     def __str__(self) -> str:
         serial = f", serial {self.serial}" if self.serial else ""

@@ -212,6 +212,6 @@ def every_monitor() -> tuple[WindowPanels, list[U8], tuple[Monitor, ...]]:
     cards = []
     for monitor in monitors:
         lines = [monitor.model or "(the EDID has no name)", f"{monitor.width_px} x {monitor.height_px}",
-                 "in the configuration:", "[[output.panels]]", monitor.setting]  # fmt: skip
+                 "in the configuration:", "[[output.panels]]", monitor.setting(monitors)]  # fmt: skip
         cards.append(identity_card(width, height, title=monitor.connector, lines=lines))
     return panels, cards, monitors

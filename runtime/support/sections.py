@@ -21,6 +21,18 @@ STRINGS_AND_COMMENTS = re.compile(
 KEY_SEPARATORS = re.compile(r"[\n=,{}\[\]]")
 M = TypeVar("M", bound=BaseModel)
 EXPECTED = "Input should be "  # beginning of many of pydantic's messages
+PLAIN = {  # pydantic's messages that name types of Python, in the words of a configuration
+    "bool_parsing": EXPECTED + "true or false",
+    "bool_type": EXPECTED + "true or false",
+    "dict_type": EXPECTED + "a table",
+    "int_parsing": EXPECTED + "a whole number",
+    "list_type": EXPECTED + "a list in brackets",
+    "model_type": EXPECTED + "a table",
+    "string_type": EXPECTED + "text in quotes",
+    "too_long": "must have at most {max_length} items",
+    "too_short": "must have at least {min_length} items",
+    "tuple_type": EXPECTED + "a list in brackets",
+}
 UNION_MEMBER = re.compile(r"literal\[.*\]|constrained-\w+")  # a type's name in the path to a field of several types
 
 
@@ -119,6 +131,8 @@ def _wrong_field(model: type[BaseModel], error: Any) -> tuple[str, str]:
     """Return the full name of the field that a pydantic error concerns, and the problem."""
     name = ".".join(str(part) for part in error["loc"] if not UNION_MEMBER.fullmatch(str(part)))
     message = error["msg"].removeprefix("Value error, ")
+    if error["type"] in PLAIN:
+        return name, PLAIN[error["type"]].format_map(error.get("ctx", {}))
     if error["type"] == "string_pattern_mismatch":
         described = _record(model, error["loc"][:-1]).model_fields[error["loc"][-1]].description
         return name, f"{error['input']!r} is not valid; expected: {described}"

@@ -11,6 +11,7 @@ import json
 import os
 import stat
 import unicodedata
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -176,19 +177,21 @@ def read_bytes(path: str | Path, *, most_bytes: int, source: str | Path = "", fi
 
 
 def read_text(path: str | Path, *, most_bytes: int = JSON_BYTES_MAX) -> str:
-    """Read a UTF-8 text file.
+    """Read a text file in UTF-8, or in UTF-16 with a byte-order mark.
 
-    Raises InputError if the file cannot be read, is larger than `most_bytes` or is not UTF-8.
+    Raises InputError if the file cannot be read, is larger than `most_bytes` or is neither.
     """
     return decoded(read_bytes(path, most_bytes=most_bytes), source=path)
 
 
 def decoded(data: bytes, *, source: str | Path) -> str:
-    """Decode UTF-8 text and drop a byte-order mark. Raises InputError if the data are not UTF-8."""
+    """Decode UTF-8 text, or UTF-16 with a byte-order mark as some Windows programs save it, and drop the mark. Raises
+    InputError if the data are neither.
+    """
     try:
-        return data.decode("utf-8-sig")
+        return data.decode("utf-16" if data.startswith((BOM_UTF16_LE, BOM_UTF16_BE)) else "utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(source, "", f"is not valid UTF-8 at byte {error.start}") from None
+        raise InputError(source, "", f"is not valid {error.encoding.upper()} at byte {error.start}") from None
 
 
 def read_json(path: str | Path, *, most_bytes: int = JSON_BYTES_MAX) -> Any:

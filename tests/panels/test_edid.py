@@ -21,6 +21,15 @@ def test_numbers_that_mean_none_are_none() -> None:
     assert parse(block(serial_number=0x01010101)).serial == ""
 
 
+def test_text_padded_with_zeros_ends_at_the_first() -> None:
+    edid = parse(block(serial_text="H9JW901197\0\0", name="C27R50x\0"))
+    assert (edid.name, edid.serial) == ("C27R50x", "H9JW901197")
+
+
+def test_control_characters_are_not_part_of_a_name() -> None:
+    assert parse(block(serial_text="A\x1b[1", name="\0\0")).serial == "A[1"
+
+
 @given(st.binary(max_size=300))
 def test_noise_is_no_edid(data: Any) -> None:
     assert parse(data) is None

@@ -3,6 +3,7 @@ show the stack's own pixels, and all panels at one rate: else phases are rescale
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import replace
 from typing import Any
 
@@ -42,6 +43,13 @@ def test_two_monitors_of_one_serial_are_told_apart_by_connector_only() -> None:
     with pytest.raises(PanelLost, match="panel 0: 2 monitors have EDID serial A"):
         bind([PanelSettings(edid_serial="A")], twins)
     assert bind([PanelSettings(edid_serial="A", connector="DP-2")], twins) == (twins[1],)
+
+
+def test_the_line_that_selects_a_monitor_selects_it_among_all() -> None:
+    twins = [monitor("DP-1", "0000000000000"), monitor("DP-2", "0000000000000", 1920), monitor("DP-3", 'a"\\', 3840)]
+    for each in twins:
+        settings = PanelSettings.model_validate(tomllib.loads(each.setting(twins)))
+        assert bind([settings], twins) == (each,)
 
 
 def test_two_panels_on_one_monitor_are_refused() -> None:
