@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from itertools import combinations
 from pathlib import Path
-from threading import Lock
+from threading import RLock
 from typing import Any, TypedDict, Unpack
 
 import numpy as np
@@ -49,7 +49,11 @@ NOTED_EVERY = 8  # `Result.notes` is based on every 8th pixel of every 8th row
 LEAST_APART_M = 0.0005  # minimum distance between two views' eyes if there are more than two
 REAL_PIXELS = 20_000  # pixels of a picture that are measured on real panels, about
 SAME_PLACE_M = 0.001  # maximum distance between an eye and its camera
-_one_at_a_time = Lock()  # a loaded model reuses its buffers
+_one_at_a_time = RLock()  # a loaded model reuses its buffers
+# A fork waits for a solution of another thread. In the child, which has no other thread, the lock would never be free.
+os.register_at_fork(
+    before=_one_at_a_time.acquire, after_in_parent=_one_at_a_time.release, after_in_child=_one_at_a_time.release
+)
 
 Eyes = Sequence[Sequence[float]] | Sequence[F64] | F64
 Pictures = Sequence[ArrayLike] | ArrayLike

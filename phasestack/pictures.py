@@ -55,17 +55,20 @@ def as_array(name: str, given: Any) -> Any:
         )
     if hasattr(given, "read"):
         raise ValueError(f"{name}: must be a picture, not an open file; pass PIL.Image.open({name})")
-    if _is_tensor(given):
-        given = given.detach().cpu()
-        given = given.float() if given.is_floating_point() else given
+    if np.ma.is_masked(given):
+        raise ValueError(f"{name}: some values are masked; pass {name}.filled(0), or another value to show there")
     try:
+        if _is_tensor(given):
+            given = given.detach().cpu()
+            given = given.float() if given.is_floating_point() else given
         array = np.asarray(given)
     except (TypeError, ValueError, RuntimeError):
         array = np.empty(0, object)
     if array.dtype.name == "bfloat16":  # a jax array
         array = array.astype(np.float32)
     if array.dtype.kind not in "buif":
-        raise ValueError(f"{name}: must be an array of numbers, not {type(given).__name__}")
+        kind = f"array of {given.dtype}" if isinstance(given, np.ndarray) else type(given).__name__
+        raise ValueError(f"{name}: must be an array of numbers, not {kind}")
     return array
 
 
@@ -93,7 +96,7 @@ def _from_pillow(name: str, image: Any) -> U8:
         return rgb_of(image, name)
     except InputError as error:
         raise ValueError(str(error)) from None
-    except OSError as error:  # Pillow notices that a file is truncated only when its pixels are read
+    except (OSError, ValueError) as error:  # only now does Pillow notice a file that is truncated or closed
         raise ValueError(f"{name}: cannot be decoded: {error}") from None
 
 

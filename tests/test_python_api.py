@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import io
 import json
+import os
+import signal
 import subprocess
 import sys
+import threading
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
@@ -47,6 +50,36 @@ def test_a_pair_becomes_layers_eye_views_and_quality(tmp_path: Path) -> None:
     assert cv2.imread(str(tmp_path / "new" / "out" / "contact-sheet.png")) is not None
     told = json.loads((tmp_path / "new" / "out" / "solve.json").read_text())
     assert told["light_db"]["1"] == pytest.approx(light_db["1"], abs=1e-3) and told["model"] == result.model
+
+
+def test_a_process_forked_during_a_solution_solves() -> None:
+    """The child waited for the thread of its parent to finish."""
+    stack = replace(STACK, width_px=64, height_px=36)
+    small: Any = (picture()[:36, :64], picture(3)[:36, :64])
+    ended = threading.Event()
+
+    def keep_solving() -> None:
+        while not ended.is_set():
+            phasestack.solve(*small, eyes_m=EYES, stack=stack, model="fast")
+
+    thread = threading.Thread(target=keep_solving)
+    phasestack.solve(*small, eyes_m=EYES, stack=stack, model="fast")
+    thread.start()
+    try:
+        for _ in range(3):
+            child = os.fork()
+            if child == 0:
+                signal.signal(signal.SIGALRM, signal.SIG_DFL)
+                signal.alarm(60)
+                try:
+                    phasestack.solve(*small, eyes_m=EYES, stack=stack, model="fast")
+                    os._exit(0)
+                finally:
+                    os._exit(1)
+            assert os.waitpid(child, 0)[1] == 0
+    finally:
+        ended.set()
+        thread.join()
 
 
 def test_light_of_a_large_picture_is_of_some_pixels_with_its_error(monkeypatch: pytest.MonkeyPatch) -> None:

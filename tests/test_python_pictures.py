@@ -47,6 +47,28 @@ def test_a_tensor_is_taken_with_its_gradient_and_in_any_precision() -> None:
     assert np.abs(as_codes(as_picture("left", floats.bfloat16())).astype(int) - CODES).max() <= 1
 
 
+def test_a_tensor_without_values_is_refused() -> None:
+    torch = pytest.importorskip("torch")
+    for tensor in (torch.zeros(CODES.shape, device="meta"), torch.zeros(CODES.shape).to_sparse()):
+        with pytest.raises(ValueError, match="left: must be an array of numbers, not Tensor"):
+            as_picture("left", tensor)
+
+
+def test_masked_closed_and_structured_pictures_are_refused_by_name() -> None:
+    closed = Image.fromarray(CODES)
+    closed.close()
+    structured = CODES.view([("red", "u1"), ("green", "u1"), ("blue", "u1")])
+    for given, said in (
+        (closed, "left: cannot be decoded: Operation on closed image"),
+        (np.ma.masked_greater(CODES, 200), r"left: some values are masked; pass left\.filled"),
+        (CODES.astype(object), "left: must be an array of numbers, not array of object"),
+        (structured, "left: must be an array of numbers, not array of .*red"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            as_picture("left", given)
+    assert np.array_equal(as_picture("left", np.ma.masked_array(CODES)), CODES), "nothing is masked"
+
+
 def test_what_rounding_makes_of_white_and_black_is_white_and_black() -> None:
     picture = np.where(CODES > 127, np.float32(1.0000003), np.float32(-1e-6))
     assert set(np.unique(as_picture("left", picture))) == {0.0, 1.0}
@@ -83,7 +105,7 @@ def test_the_advice_of_a_refusal_makes_a_picture(given: Any, advice: str) -> Non
         ("a.png", r"must be a picture, not a file name; read it with PIL.Image.open\('a.png'\)"),
         (Path("a.png"), r"PIL.Image.open\('a.png'\)"),
         ([[1, 2], [3]], "must be an array of numbers, not list"),
-        (np.full((20, 30, 3), "a"), "must be an array of numbers, not ndarray"),
+        (np.full((20, 30, 3), "a"), "must be an array of numbers, not array of <U1"),
         (None, "must be an array of numbers, not NoneType"),
         (
             np.full((20, 30, 3), np.nan),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import cache
 from itertools import pairwise
 from typing import TypeVar
@@ -24,7 +24,7 @@ def parallel_map(work: Callable[[Item], Result], items: Sequence[Item]) -> list[
     threads = cv2.getNumThreads()
     if threads < 2 or len(items) < 2:
         return [work(item) for item in items]
-    others = [_pool(threads).submit(work, item) for item in items[1:]]
+    others = [_submitted(_pool(threads), work, item) for item in items[1:]]
     try:
         first = work(items[0])  # runs on this thread, to avoid waking another one
     finally:
@@ -47,6 +47,19 @@ def on_rows(work: Callable[[int, int], None], rows: int, *, threads: int | None 
 def fresh_threads() -> None:
     """Make the next `parallel_map` call start new threads, which inherit the caller's niceness."""
     _pool.cache_clear()
+
+
+def _submitted(pool: ThreadPoolExecutor, work: Callable[[Item], Result], item: Item) -> Future[Result]:
+    """Submit a call to the pool, or make it on this thread if the main thread has ended and pools take no more calls."""
+    try:
+        return pool.submit(work, item)
+    except RuntimeError:
+        done: Future[Result] = Future()
+        try:
+            done.set_result(work(item))
+        except Exception as error:
+            done.set_exception(error)
+        return done
 
 
 @cache

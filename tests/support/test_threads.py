@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 
@@ -59,6 +61,24 @@ def test_a_forked_process_starts_threads_of_its_own() -> None:
         signal.alarm(30)
         os._exit(0 if parallel_map(abs, [-1, -2, -3]) == [1, 2, 3] else 1)
     assert os.waitpid(child, 0)[1] == 0
+
+
+def test_a_thread_that_outlives_the_main_one_still_works() -> None:
+    """Pools take no more calls once the main thread has ended."""
+    program = """
+import threading
+import cv2
+from runtime.support.threads import parallel_map
+
+def work():
+    threading.main_thread().join()
+    print(parallel_map(abs, [-1, -2, -3]))
+
+cv2.setNumThreads(2)
+threading.Thread(target=work).start()
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert (done.stdout, done.stderr) == ("[1, 2, 3]\n", "")
 
 
 def test_the_presenter_comes_before_all_others_and_what_it_starts_does_not() -> None:
