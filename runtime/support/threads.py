@@ -50,7 +50,7 @@ def fresh_threads() -> None:
 
 
 def _submitted(pool: ThreadPoolExecutor, work: Callable[[Item], Result], item: Item) -> Future[Result]:
-    """Submit a call to the pool, or make it on this thread if the main thread has ended and pools take no more calls."""
+    """Submit a call to the pool, or make it here if the main thread has ended and no pool takes more calls."""
     try:
         return pool.submit(work, item)
     except RuntimeError:
