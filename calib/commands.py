@@ -9,14 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from runtime.errors import InputError
-from runtime.support.options import number
+from runtime.support.options import ConfigOption, JsonOption, number
 from runtime.support.ranges import SCALE
 
 if TYPE_CHECKING:
     from runtime.config import Settings
-
-ConfigOption = Annotated[Path | None, typer.Option(help="configuration file (default: built-in settings)")]
-JsonOption = Annotated[bool, typer.Option("--json", help="print the result as a JSON object")]
 
 app = typer.Typer(
     no_args_is_help=True,

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from runtime.errors import InputError, MissingPart
-from runtime.support.options import number
+from runtime.support.options import JsonOption, number
 
 
 def require(*modules: str) -> None:
@@ -60,7 +60,7 @@ def train(
         Literal["auto", "cpu", "cuda"], typer.Option(help="device to train on (auto uses a GPU if torch finds one)")
     ] = "auto",
     resume: Annotated[bool, typer.Option("--resume", help="continue from the checkpoint in --out")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print the result as a JSON object")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Train a picture network by gradient descent on the light that reaches the eyes.
 
@@ -127,7 +127,7 @@ def export(
         Literal["left-right", "right-left"], typer.Option(help="for eyereal: order of the eyes in the training data")
     ] = "left-right",
     option: Options = None,
-    as_json: Annotated[bool, typer.Option("--json", help="print the checks as a JSON object")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Write a model and its contract to an ONNX file, provided that its results agree with torch's.
 
@@ -157,7 +157,7 @@ def export(
 
 def validate(
     file: Annotated[Path, typer.Argument(help="ONNX file to check")],
-    as_json: Annotated[bool, typer.Option("--json", help="print the checks as a JSON object")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Check that a model file meets its contract and gives valid results for extreme inputs.
 

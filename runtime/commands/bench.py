@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from runtime.support.options import JsonOption
+
 app = typer.Typer()
 
 
@@ -14,7 +16,7 @@ app = typer.Typer()
 def bench(
     context: typer.Context,
     out: Annotated[Path | None, typer.Option(help="write the measurement to this JSON file")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="print the result as a JSON object")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Measure the shipped models' run time, memory and light PSNR, or compare two measurements.
 
@@ -49,7 +51,7 @@ def bench(
 def compare(
     old: Annotated[Path, typer.Argument(help="JSON file with the earlier measurement")],
     new: Annotated[Path, typer.Argument(help="JSON file with the later measurement")],
-    as_json: Annotated[bool, typer.Option("--json", help="print the comparison as a JSON object")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """List every figure that changed by more than the noise. Exits with 1 if any figure got worse.
 

@@ -9,6 +9,8 @@ from typing import Annotated
 
 import typer
 
+from runtime.support.options import JsonOption
+
 FRAMES, MEASURED_EVERY = 42, 14  # in refreshes; in 0.7 s, the head has started to move
 LONGEST_S, LEAST = 45.0, 15  # the demo's time limit; minimum number of refreshes
 
@@ -20,7 +22,7 @@ def demo(
         typer.Option(min=1, help="number of refreshes to show (the full recording has 600 and takes several minutes)"),
     ] = FRAMES,
     verbose: Annotated[bool, typer.Option("--verbose", help="print all figures of the summary")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print the summary as a JSON object")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Play a built-in recording of a moving head through the whole pipeline without a screen.
 

@@ -17,6 +17,7 @@ import typer
 
 from runtime.errors import PhasestackError
 from runtime.support.extras import missing_extra
+from runtime.support.options import JsonOption
 from runtime.support.plugins import is_plugin, plugin_class
 
 if TYPE_CHECKING:
@@ -52,7 +53,7 @@ def doctor(
             "--service", help="check with the user, groups and configuration of the systemd service; requires root"
         ),
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print the result as a JSON object")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Check the settings, sensor, permissions, OpenGL, monitors, scene, model, calibration and service.
 

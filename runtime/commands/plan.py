@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from runtime.support.options import blame_option, number
+from runtime.support.options import ConfigOption, JsonOption, ModelOption, blame_option, number
 
 
 def plan(
-    config: Annotated[
-        Path | None, typer.Option(help="configuration file (run `phasestack config` to print one)")
-    ] = None,
+    config: ConfigOption = None,
     scene: Annotated[str | None, typer.Option(help="scene to show: a built-in name, a file or a folder")] = None,
-    model: Annotated[str | None, typer.Option(help="model to use: fast, balanced, best, sart or an ONNX file")] = None,
+    model: ModelOption = None,
     scale: Annotated[float, number(0.05, 2.0, help="scale factor for the pixel dimensions of the panels")] = 1.0,
-    as_json: Annotated[bool, typer.Option("--json", help="print the result as a JSON object")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """List the work that the solver can skip for this scene, with reasons, time saved and quality lost.
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from runtime.errors import FatalError, InputError
-from runtime.support.options import number
+from runtime.support.options import ConfigOption, JsonOption, number
 from runtime.support.ranges import RECORD_MOST_S
 
 if TYPE_CHECKING:
@@ -28,9 +28,7 @@ OVER = ("ended", "failed")
 
 def record(
     out: Annotated[Path, typer.Option(help="recording to write (.mcap)")],
-    config: Annotated[
-        Path | None, typer.Option(help="configuration file (run `phasestack config` to print one)")
-    ] = None,
+    config: ConfigOption = None,
     images: Annotated[
         bool, typer.Option("--images", help="also record colour and depth pictures, which show people's faces")
     ] = False,
@@ -58,7 +56,7 @@ def record(
         float | None,
         number(0, 100, "mm", help="standard deviation of the sensor noise on each axis (only with --motion)"),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="print the result as a JSON object")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Record eye positions, when they were seen and, with --images, pictures. Press Ctrl-C to stop.
 

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from runtime.support.options import JsonOption
+
 
 def report(
     out: Annotated[Path, typer.Option(help="folder for index.html, report.json and the plots")] = Path("report"),
@@ -23,7 +25,7 @@ def report(
     quick: Annotated[
         bool, typer.Option("--quick", help="measure only quarter-size panels and fewer reference methods")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print the result as a JSON object")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Measure every method's light PSNR and run time on this machine, and write a page with the results.
 

@@ -9,13 +9,11 @@ from typing import Annotated
 
 import typer
 
-from runtime.support.options import blame_option, number
+from runtime.support.options import ConfigOption, JsonOption, LayoutOption, ModelOption, blame_option, number
 
 
 def run(
-    config: Annotated[
-        Path | None, typer.Option(help="configuration file (run `phasestack config` to print one)")
-    ] = None,
+    config: ConfigOption = None,
     replay: Annotated[
         str | None,
         typer.Option(
@@ -32,11 +30,8 @@ def run(
     ] = False,
     out: Annotated[Path | None, typer.Option(help="folder for pictures, frames.jsonl and summary.json")] = None,
     scene: Annotated[str | None, typer.Option(help="scene to show: a built-in name, a file or a folder")] = None,
-    layout: Annotated[
-        str | None,
-        typer.Option(help="arrangement of the views in the pictures (same values as the content.layout setting)"),
-    ] = None,
-    model: Annotated[str | None, typer.Option(help="model to use: fast, balanced, best, sart or an ONNX file")] = None,
+    layout: LayoutOption = None,
+    model: ModelOption = None,
     scale: Annotated[float, number(0.05, 2.0, help="scale factor for the pixel dimensions of offscreen panels")] = 1.0,
     backend: Annotated[
         str | None,
@@ -46,7 +41,7 @@ def run(
         int, typer.Option(min=0, help="write the layers to the --out folder every N refreshes (0 for never)")
     ] = 0,
     verbose: Annotated[bool, typer.Option("--verbose", help="print all figures of the summary")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print the summary as a JSON object")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Run the display until SIGTERM. SIGHUP reloads the configuration.
 

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from runtime.support.options import JsonOption
+
 if TYPE_CHECKING:
     from runtime.records import F64
     from runtime.report.stability.calibration import Fit
@@ -15,7 +17,7 @@ if TYPE_CHECKING:
 def stability(
     out: Annotated[Path | None, typer.Option(help="folder to write stability.json to")] = None,
     full: Annotated[bool, typer.Option("--full", help="also run the long cases, which take minutes")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print the result as a JSON object")] = False,
+    as_json: JsonOption = False,
     record: Annotated[
         Path | None,
         typer.Option(help="file to save the measured errors to as new limits (use this after changing a model)"),

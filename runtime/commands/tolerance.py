@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from runtime.support.options import JsonOption
+
 
 def tolerance(
     config: Annotated[
@@ -18,7 +20,7 @@ def tolerance(
     out: Annotated[
         Path | None, typer.Option(help="folder for index.html, tolerance.json and the plots [default: tolerance]")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="print the result as a JSON object")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Measure the cost of each imperfection of real panels, crosstalk, and viewing freedom.
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from runtime.support.options import blame_option, number
+from runtime.support.options import LayoutOption, ModelOption, blame_option, number
 
 
 def try_(
@@ -15,11 +15,8 @@ def try_(
         Path | None, typer.Option(help="configuration file (default: settings for panels of 960x540 pixels)")
     ] = None,
     scene: Annotated[str | None, typer.Option(help="scene to show: a built-in name, a file or a folder")] = None,
-    layout: Annotated[
-        str | None,
-        typer.Option(help="arrangement of the views in the pictures (same values as the content.layout setting)"),
-    ] = None,
-    model: Annotated[str | None, typer.Option(help="model to use: fast, balanced, best, sart or an ONNX file")] = None,
+    layout: LayoutOption = None,
+    model: ModelOption = None,
     webcam: Annotated[bool, typer.Option("--webcam", help="track your head with this PC's webcam")] = False,
     port: Annotated[int, typer.Option(min=0, max=65535, help="port to listen on (0 for any free port)")] = 0,
     no_browser: Annotated[

@@ -4,13 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 
 from runtime.errors import InputError
 from runtime.support.ranges import EYE_MOST_M, refusal
 
+ConfigOption = Annotated[Path | None, typer.Option(help="configuration file (default: built-in settings)")]
+JsonOption = Annotated[bool, typer.Option("--json", help="print the result as a JSON object")]
+LayoutOption = Annotated[
+    str | None,
+    typer.Option(help="arrangement of the views in the pictures (same values as the content.layout setting)"),
+]
+ModelOption = Annotated[str | None, typer.Option(help="model to use: fast, balanced, best, sart or an ONNX file")]
 OPTION_OF = {("content", "scene"): "scene", ("model", "name"): "model"}  # options, keyed by the setting they set
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import mmap
 import os
-import re
 import resource
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -250,13 +249,3 @@ def test_too_little_memory_is_an_exception() -> None:
             os._exit(0)
         os._exit(1)
     assert os.waitpid(child, 0)[1] == 0
-
-
-def test_a_step_s_symbols_have_one_name_everywhere() -> None:
-    """D was `bound` in torch, `curvature` in C++ and GLSL, and either in the mathematics."""
-    page = (ROOT / "docs/mathematics.md").read_text(encoding="utf-8")
-    row = re.search(r"^\| e, g, D in a step \|.*\| (.*) \|$", page, re.MULTILINE)
-    assert row is not None
-    for path in ("runtime/kernels/solver.cpp", "runtime/model/gl/shaders/compare.frag.glsl", "model_export/light.py"):
-        words = set(re.findall(r"\w+", (ROOT / path).read_text(encoding="utf-8")))
-        assert set(re.findall(r"`(\w+)`", row[1])) <= words, path
