@@ -37,6 +37,7 @@ from runtime.clock import NS_PER_S
 from runtime.errors import ContentFailure, InputError, one_line
 from runtime.records import F32, U8, U16
 from runtime.support.background import begin
+from runtime.support.untrusted_input import parsed_json
 
 log = logging.getLogger("phasestack.content")
 library_log = logging.getLogger("phasestack.websockets")  # the library describes each failed handshake by a traceback
@@ -222,7 +223,12 @@ class _Client:
     def __init__(self, connection: ServerConnection, hello: dict[str, Any]) -> None:
         """Read a program's first message. Raises ValueError if one of its fields is invalid."""
         self.connection = connection
-        self.listens = bool(hello.get("listens"))
+        for name in ("listens", "memory"):
+            if not isinstance(hello.get(name, False), bool):
+                raise ValueError(f"{name} must be true or false")
+        if hello.get("rows", "top-down") not in ("top-down", "bottom-up"):
+            raise ValueError("rows must be top-down or bottom-up")
+        self.listens = hello.get("listens", False)
         self.bottom_up = hello.get("rows") == "bottom-up"
         self.name = one_line(str(hello.get("name", "unnamed")), most=80)
         scale, depth = hello.get("scale", 1), hello.get("depth")
@@ -235,7 +241,7 @@ class _Client:
             raise ValueError(f"encoding must be {' or '.join(ENCODINGS)}")
         self._scale = scale
         self._depth: np.dtype[Any] | None = None if depth is None else DEPTHS[depth]
-        self._shares_memory, self._frames_shared = bool(hello.get("memory")), 0
+        self._shares_memory, self._frames_shared = hello.get("memory", False), 0
         self._memory: _Memory | None = None
         self._messages: deque[str] = deque(maxlen=1 if self.listens else 2 * IN_FLIGHT_MAX)
         self._has_messages = asyncio.Event()
@@ -384,6 +390,8 @@ class ProgramServer:
             close_timeout=CLOSED_WITHIN_S,
             max_size=MESSAGE_MAX_BYTES,
             max_queue=QUEUED_MAX,
+            # Some programs' libraries drop a connection whose server selects none of the subprotocols that they offer.
+            select_subprotocol=lambda _, offered: next(iter(offered), None),
             compression=None,
             **options,
         ):
@@ -416,11 +424,7 @@ class ProgramServer:
         client: _Client | None = None
         why = "the program closed the connection"
         try:
-            async with asyncio.timeout(HELLO_S):
-                hello = json.loads(await connection.recv())
-            if not isinstance(hello, dict):
-                raise ValueError("the first message is not a JSON object")
-            client = _Client(connection, hello)
+            client = _Client(connection, await _greeting(connection))
             self._welcome(client)
             sending = asyncio.ensure_future(client.send())
             try:
@@ -428,8 +432,6 @@ class ProgramServer:
                     self._take(client, message)
             finally:
                 sending.cancel()
-        except TimeoutError:
-            pass
         except ConnectionClosed as error:
             if error.sent is not None and error.sent.code == TOO_BIG:
                 why = f"a message is larger than {MESSAGE_MAX_BYTES} bytes"
@@ -500,6 +502,20 @@ class ProgramServer:
             if self.newest is None or number > self.newest.number:
                 self.newest = DrawnPictures(number, frame.pictures)
             self._changed.notify_all()
+
+
+async def _greeting(connection: ServerConnection) -> dict[str, Any]:
+    """Return a program's first message. Raises ValueError if it is not a JSON object, or late."""
+    try:
+        async with asyncio.timeout(HELLO_S):
+            hello = parsed_json(await connection.recv(), source="the first message")
+    except TimeoutError:
+        raise ValueError(f"no first message within {HELLO_S:g} s") from None
+    except InputError as error:
+        raise ValueError(str(error)) from None
+    if not isinstance(hello, dict):
+        raise ValueError("the first message is not a JSON object")
+    return hello
 
 
 def _message(number: int, asked: AskedViews, width_px: int, height_px: int, eyes: Sequence[dict[str, Any]]) -> str:

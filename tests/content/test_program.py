@@ -29,8 +29,10 @@ import pytest
 from PIL import Image
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
+from websockets.typing import Subprotocol
 
 from runtime.config import ContentSettings, StackGeometry
+from runtime.content import program_server
 from runtime.content.placed import Placing, placed_source
 from runtime.content.program import camera_of
 from runtime.content.registry import open_content
@@ -490,6 +492,9 @@ def test_a_program_that_cannot_open_the_memory_sends_its_pictures(source: Any) -
         ({"scale": 0}, "scale must be a number from 0.1 to 1"),
         ({"depth": "int8"}, "depth must be uint16 or float32"),
         ({"encoding": "png"}, "encoding must be raw or jpeg"),
+        ({"rows": "bottomup"}, "rows must be top-down or bottom-up"),
+        ({"listens": "false"}, "listens must be true or false"),
+        ({"memory": 1}, "memory must be true or false"),
     ],
 )
 def test_a_wrong_greeting_is_answered_with_the_reason(source: Any, hello: dict, why: str) -> None:
@@ -499,14 +504,35 @@ def test_a_wrong_greeting_is_answered_with_the_reason(source: Any, hello: dict, 
             socket.recv(10)
 
 
-@pytest.mark.parametrize("hello", ["{", "[]", b"\x00"])
-def test_who_begins_with_nonsense_is_sent_away(source: Any, hello: Any) -> None:
+@pytest.mark.parametrize(
+    ("hello", "why"),
+    [
+        ("{", "the first message: malformed JSON"),
+        ("[]", "the first message is not a JSON object"),
+        (b"\xff", "the first message: is not valid UTF-8"),
+        ("[" * 50_000, "the first message: the JSON is nested"),
+        (None, "no first message within 0.2 s"),
+    ],
+)
+def test_who_begins_with_nonsense_or_silence_is_sent_away(
+    source: Any, monkeypatch: pytest.MonkeyPatch, hello: Any, why: str
+) -> None:
+    if hello is None:
+        monkeypatch.setattr(program_server, "HELLO_S", 0.2)
     with connect(source.program["address"]) as socket:
-        socket.send(hello)
-        with pytest.raises(ConnectionClosed):
+        if hello is not None:
+            socket.send(hello)
+        with pytest.raises(ConnectionClosed) as told:
             socket.recv(10)
+    assert told.value.rcvd is not None and told.value.rcvd.code == 1007
+    assert told.value.rcvd.reason.startswith(why)
     with pytest.raises(ContentFailure, match="no program is connected"):
         drawn(source)
+
+
+def test_a_client_that_insists_on_a_subprotocol_gets_its_first(source: Any) -> None:
+    with connect(source.program["address"], subprotocols=[Subprotocol("chat"), Subprotocol("3d")]) as socket:
+        assert socket.subprotocol == "chat"
 
 
 def test_without_the_token_nobody_connects(source: Any) -> None:
