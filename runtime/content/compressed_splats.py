@@ -42,7 +42,9 @@ def load_compressed_splats(path: Path) -> Gaussians:
     """
     try:
         with np.errstate(all="ignore"):
-            return _spz(path) if path.suffix.lower() == ".spz" else _sog(path)
+            if path.suffix.lower() == ".spz":
+                return _spz(path, untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes))
+            return _sog(path)
     except (InputError, ImportError, MemoryError):
         raise
     except Exception:  # zlib, zipfile and zstandard raise various errors, as does malformed JSON
@@ -50,9 +52,19 @@ def load_compressed_splats(path: Path) -> Gaussians:
         raise InputError(path, "", f"is damaged or is not {kind} file") from None
 
 
-def _spz(path: Path) -> Gaussians:
-    """Read an SPZ file: the positions of all splats, then all opacities, colours, scales, rotations and harmonics."""
-    data = untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)
+def spz_splats(path: Path, data: bytes) -> Gaussians:
+    """Read splats from SPZ data that are part of the file `path`. Raises InputError if they are damaged."""
+    try:
+        with np.errstate(all="ignore"):
+            return _spz(path, data)
+    except (InputError, ImportError, MemoryError):
+        raise
+    except Exception:  # zlib and zstandard raise various errors
+        raise InputError(path, "", "contains damaged SPZ data") from None
+
+
+def _spz(path: Path, data: bytes) -> Gaussians:
+    """Read SPZ data: the positions of all splats, then all opacities, colours, scales, rotations and harmonics."""
     zipped = zlib.decompressobj(31) if data[:2] == b"\x1f\x8b" else None
     head = zipped.decompress(data, SPZ_SHORT) if zipped else data[: SPZ_HEADER.size]
     mark, version, count, degree, bits, _, _, table = SPZ_HEADER.unpack(head.ljust(SPZ_HEADER.size, b"\0"))

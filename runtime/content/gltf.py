@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from runtime.content import gltf_splats
 from runtime.content.base import WHITE
-from runtime.content.gaussians import dotted
+from runtime.content.gaussians import Gaussians, dotted
 from runtime.content.gltf_file import COMPRESSED, WAY_OUT, Array, GltfFile, Read, Table, fractions
 from runtime.content.parts import BLACK, Part, Sampler, Wrap, coded
 from runtime.content.shapes import Origin, Shape, flat_normals, placed
@@ -31,6 +32,7 @@ GLOSSY = "KHR_materials_pbrSpecularGlossiness"
 DRAWN = {
     DRACO, GLOSSY, "KHR_materials_unlit", "KHR_materials_emissive_strength", "KHR_texture_transform",
     "KHR_mesh_quantization", "EXT_texture_webp", "EXT_texture_avif", INSTANCES, VISIBILITY,
+    *gltf_splats.NAMES,
 }  # fmt: skip
 UNSEEN = {"KHR_materials_ior", "KHR_materials_specular", "KHR_materials_variants", "KHR_xmp_json_ld"}
 # Extensions that are ignored, even if a file requires them.
@@ -42,7 +44,7 @@ WITHOUT = UNSEEN | {
 
 
 class GltfScene:
-    """Loads a glTF file's scene as parts and points, and records any features that are not drawn."""
+    """Loads a glTF file's scene as parts, points and splats, and records any features that are not drawn."""
 
     def __init__(self, path: Path, data: bytes, read: Read, origin: Origin) -> None:
         """Load a scene from glTF or GLB data; `read` reads other files, and parts and points are relative to `origin`.
@@ -52,6 +54,7 @@ class GltfScene:
         self._hidden: set[int] = set()  # numbers of the invisible nodes
         self.parts: list[Part] = []
         self.points: list[tuple[F32, F32]] = []  # positions (n, 3) and sRGB colours (n, 3), 0-1
+        self.splats: list[Gaussians] = []
         self.left_out: set[str] = set()  # features that are not drawn
         try:
             self.file = GltfFile(path, data, read)
@@ -150,6 +153,15 @@ class GltfScene:
         (4, 4) or, for a skinned mesh, one per joint (j, 4, 4).
         """
         file, mode = self.file, primitive.get("mode", TRIANGLES)
+        if gltf_splats.is_splats(primitive):
+            splats = gltf_splats.read_splats(file, primitive)
+            self.splats.append(
+                gltf_splats.turned(splats, matrices[0] if matrices.ndim == 3 else matrices, self._origin)
+            )
+            untrusted_input.within(
+                sum(len(one.centres) for one in self.splats), LIMITS.splats, source=self.path, field="splats"
+            )
+            return
         if "POSITION" not in primitive["attributes"]:
             return
         values, corners = self._draco(primitive)

@@ -13,8 +13,9 @@ from urllib.parse import unquote
 import numpy as np
 
 from runtime.content.base import ContentInfo, ContentSource
-from runtime.content.gaussians import LARGEST_COORDINATE, of_points
+from runtime.content.gaussians import LARGEST_COORDINATE, Gaussians, bounds, of_points
 from runtime.content.gltf import GltfScene
+from runtime.content.gltf_splats import together
 from runtime.content.parts import OUTLINED_MAX, UNCOLOURED, Part, merged
 from runtime.content.placing import GLTF, SceneFile
 from runtime.content.ply import read_header
@@ -35,7 +36,7 @@ OFF_COUNTS = re.compile(rb"^\s*[A-Z4n]*OFF\s+(?:#.*\s+)*(\d{1,18})\s+(\d{1,18})"
 
 @dataclass(frozen=True, slots=True)
 class MeshData:
-    """Triangles or points from a mesh file, in the file's coordinates relative to `origin`."""
+    """Triangles, or points and splats, from a mesh file, in the file's coordinates relative to `origin`."""
 
     parts: tuple[Part, ...]
     points: tuple[tuple[F32, F32], ...]  # positions (n, 3) and colours (n, 3); empty if there are parts
@@ -43,6 +44,7 @@ class MeshData:
     low: F64  # (3,) lowest corner of the visible content, in the file's coordinates
     high: F64  # (3,) highest corner
     facing: F64  # (3,) area-weighted mean normal; the length is at most 1, and 0 for a closed surface
+    splats: tuple[Gaussians, ...] = ()  # relative to `origin`; empty if there are parts
     left_out: tuple[str, ...] = ()  # features in the file that are not drawn
 
 
@@ -57,7 +59,8 @@ def prepare(file: SceneFile) -> Callable[..., ContentSource]:
     matrix = file.placed(data.low, data.high, facing=data.facing)
     matrix[:3, 3] += matrix[:3, :3] @ data.origin
     if not data.parts:
-        splats = of_points(*map(np.concatenate, zip(*data.points, strict=True)))
+        points = [of_points(*map(np.concatenate, zip(*data.points, strict=True)))] if data.points else []
+        splats = together([*data.splats, *points])
         return partial(SplatSource, splats, stack_from_scene=matrix, info=info)
     parts = []
     alike = merged(data.parts)
@@ -77,6 +80,7 @@ def load_mesh(path: Path) -> MeshData:
     _check_counts(path, data)
     parts: list[Part] = []
     points: list[tuple[F32, F32]] = []
+    splats: list[Gaussians] = []
     left_out: set[str] = set()
     origin = Origin()
     with np.errstate(all="ignore"):  # `_check` reports coordinates that overflow
@@ -88,7 +92,7 @@ def load_mesh(path: Path) -> MeshData:
             parts = [_binary_stl(data, origin)]
         elif path.suffix.lower() in GLTF:
             scene = GltfScene(path, data, folder_reader(path, "uri"), origin)
-            parts, points, left_out = scene.parts, scene.points, scene.left_out
+            parts, points, left_out, splats = scene.parts, scene.points, scene.left_out, scene.splats
         else:
             from runtime.content.other_meshes import read_mesh
 
@@ -98,10 +102,17 @@ def load_mesh(path: Path) -> MeshData:
     untrusted_input.within(sum(len(place) for place, _ in points), LIMITS.splats, source=path, field="points")
     if parts and points:
         left_out, points = left_out | {"points and lines"}, []
-    places = [*(part.shape.positions_m for part in parts), *(place for place, _ in points)]
+    if parts and splats:
+        left_out, splats = left_out | {"splats"}, []
+    places = [
+        *(one.centres for one in splats),
+        *(part.shape.positions_m for part in parts),
+        *(place for place, _ in points),
+    ]
     _check(path, parts, places, left_out)
     total, area = np.zeros(3), 0.0
     ends = [end for place, _ in points for end in (place.min(0), place.max(0))]
+    ends += [end for one in splats for end in bounds(one)]
     for part in parts:
         for first in range(0, len(part.shape.triangles), AT_ONCE):
             corner = part.shape.positions_m[part.shape.triangles[first : first + AT_ONCE]].astype(np.float64)
@@ -115,7 +126,7 @@ def load_mesh(path: Path) -> MeshData:
     shift = np.zeros(3) if origin.point is None else origin.point
     low, high = (np.asarray(end(ends, 0), np.float64) + shift for end in (np.min, np.max))
     said = tuple(untrusted_input.shown(name) for name in sorted(left_out))
-    return MeshData(tuple(parts), tuple(points), shift, low, high, total / (area or 1.0), said)
+    return MeshData(tuple(parts), tuple(points), shift, low, high, total / (area or 1.0), tuple(splats), said)
 
 
 def folder_reader(path: Path, field: str) -> Callable[[str], bytes]:
