@@ -58,19 +58,12 @@ class ColumnLaw:
             return u
         return np.asarray(self.middle - np.expm1(-self.bend * (u - self.middle)) / self.bend)
 
-    def column_from_homography(self, t: Columns) -> Columns:
-        """Return u for an array of coordinates t. Coordinates beyond F yield columns far outside the raster."""
-        if not self.bend:
-            return t
-        return np.asarray(self.middle - np.log(np.maximum(1 - self.bend * (t - self.middle), BEYOND_F)) / self.bend)
-
     def mirrored(self, width_px: int) -> ColumnLaw:
         """Return the law for a raster with its `width_px` columns in reverse order."""
         return ColumnLaw(-self.bend, width_px - self.middle) if self.bend else self
 
 
 EVEN_COLUMNS = ColumnLaw()
-BEYOND_F = 1e-9  # lower limit for the logarithm's argument
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,8 +27,6 @@ from runtime.model.warp import warp
 from tests.model.scenes import eyes
 from tests.model.test_steps import STACK, STACKS, begun, panels_of
 
-ROOT = Path(__file__).parents[2]
-
 
 def test_kernels_of_another_version_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(kernels, "INTERFACE", kernels.INTERFACE + 1)

@@ -12,11 +12,11 @@ from runtime.optics.carried import expected_psnrs_db
 from runtime.optics.light import Sampling as Rays
 from runtime.optics.real.cells import (
     BANDS_NM,
+    C128,
     DESIGN_NM,
     FIRST_MINIMUM,
     Cell,
     Kind,
-    crossed_intensity,
     retarder,
     retarder_between_quarter_waves,
     rotator,
@@ -32,6 +32,11 @@ STACK = PanelStack(0.12, 0.09, (-0.03, 0.0, 0.03), 160, 120)
 EYES = np.array([[0.6, -0.0315, 0.02], [0.6, 0.0315, 0.02]])
 MIDDLE = np.array([[0.6, 0.0, 0.0]])
 CENTRE = np.zeros((1, 3))
+
+
+def crossed_intensity(matrix: C128) -> F64:
+    """Share of light polarized along x that leaves a cell polarized along y."""
+    return np.asarray(np.abs(matrix[..., 1, 0]) ** 2)
 
 
 def random() -> np.random.Generator:

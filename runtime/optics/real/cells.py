@@ -152,8 +152,3 @@ def twisted_retardance(angles_rad: F64, mauguin: float, wavelength_nm: float) ->
     intensity = np.maximum.accumulate(1.0 - (math.pi / 2 * np.sinc(gamma / math.pi)) ** 2)
     wanted = np.sin(angles_rad) ** 2 * intensity[-1]
     return np.asarray(np.interp(wanted, intensity, betas) * (mauguin / FIRST_MINIMUM))
-
-
-def crossed_intensity(matrix: C128) -> F64:
-    """Return the share of light polarized along x that leaves a cell polarized along y."""
-    return np.asarray(np.abs(matrix[..., 1, 0]) ** 2)
