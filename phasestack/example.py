@@ -27,10 +27,7 @@ class ExamplePair:
     fov_deg: float  # horizontal
 
     def save(self, folder: str | Path) -> None:
-        """Write the pictures and the geometry to a folder that `phasestack report --pairs` can read.
-
-        The files are left.png, right.png, panels.json and pair.json.
-        """
+        """Write left.png, right.png, panels.json and pair.json to a folder for `phasestack report --pairs`."""
         out, stack = Path(folder), self.stack
         panels = {"width_m": stack.width_m, "height_m": stack.height_m, "x_m": stack.x_m}
         for name, picture in (("left.png", self.left), ("right.png", self.right)):

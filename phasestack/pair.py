@@ -273,18 +273,11 @@ def solve_each(
     eye_sigma_mm: float = 1.0,
     progress: bool = True,
 ) -> Iterator[Result]:
-    """Solve many pairs one after another, and yield each pair's result.
+    """Solve many pairs (left picture, right picture, eyes_m) one after another, and yield each pair's
+    result.
 
-    Args:
-        pairs: Tuples (left picture, right picture, eyes_m) as in `solve`. Each pair is read only when its turn comes,
-            so `pairs` may be a generator.
-        fov_deg: All pictures' horizontal field of view, in degrees.
-        model: Model as in `solve`.
-        eye_sigma_mm: Tracking error to allow for, as in `solve`.
-        progress: Show progress on stderr.
-
-    Raises:
-        ValueError: An argument is invalid. The message names the pair and the argument.
+    Each pair is read only when its turn comes, so `pairs` may be a generator. The other arguments are those of `solve`;
+    `progress` is shown on stderr. Raises ValueError, which names the pair and the argument, for an invalid one.
     """
     total = len(pairs) if isinstance(pairs, Sized) else None
     solve_one = partial(solve, stack=stack, fov_deg=fov_deg, model=model, eye_sigma_mm=eye_sigma_mm)

@@ -51,18 +51,12 @@ class SimulatedClock:
 
 
 class Stopwatch:
-    """Stopwatch that adds up the real time spent in named stages, in milliseconds.
-
-    Each stage begins when the previous one ends, and ends when `lap` is called with its name. The totals are kept in
-    `stage_ms`.
+    """Adds up the real time spent in named stages, in ms, in `stage_ms`. A stage ends with a `lap` of its
+    name.
     """
 
     def __init__(self, *stages: str) -> None:
-        """Start the first stage.
-
-        Args:
-            stages: Names of stages to list in `stage_ms` even if they never occur.
-        """
+        """Start the first stage. `stages` are listed in `stage_ms` even if they never occur."""
         self.stage_ms = dict.fromkeys(stages, 0.0)
         self._last_ns = time.perf_counter_ns()
 

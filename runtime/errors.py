@@ -22,10 +22,9 @@ PASSING = frozenset(
 
 
 def without_secrets(text: str) -> str:
-    """Return the text with any user names and passwords before an `@` in URLs removed.
-
-    >>> without_secrets("rtsp://user:a@b@host/door"), without_secrets("/etc/rtsp:/user:a@host/door")
-    ('rtsp://host/door', '/etc/rtsp:/host/door')
+    """Return the text with any user names and passwords before an `@` in URLs removed. >>>
+    without_secrets("rtsp://user:a@b@host/door"), without_secrets("/etc/rtsp:/user:a@host/door") ('rtsp://host/door',
+    '/etc/rtsp:/host/door')
     """
     return _USER_OF_ADDRESS.sub(r"\1", text) if ":/" in text else text
 
@@ -55,10 +54,8 @@ class FatalError(PhasestackError):
 
 
 class InputError(FatalError):
-    """Invalid input from a user. The message names the file or option, and the invalid field.
-
-    >>> str(InputError("panels.toml", "x_m", "must ascend"))
-    'panels.toml: x_m: must ascend'
+    """Invalid input from a user. The message names the file or option, and the invalid field. >>>
+    str(InputError("panels.toml", "x_m", "must ascend")) 'panels.toml: x_m: must ascend'
     """
 
     def __init__(self, source: str | Path, field: str, problem: str) -> None:
@@ -79,9 +76,8 @@ class TransientError(PhasestackError):
 
 
 class SensorLost(TransientError):
-    """The sensor is disconnected, hangs or delivers invalid data.
-
-    The sensor thread closes and reopens the sensor, after a delay that doubles each time up to a maximum.
+    """The sensor is disconnected, hangs or delivers invalid data. It is reopened, after longer and longer
+    delays.
     """
 
 
@@ -102,10 +98,8 @@ class ModelFailure(TransientError):
 
 
 class EyesNotServed(ModelFailure):
-    """The model does not support the requested eye positions.
-
-    The failure is transient because a moving viewer may return to a supported position. Unsupported positions given in
-    a command's options are refused.
+    """The model does not support the requested eye positions. The failure is transient because a moving
+    viewer may return to a supported position. Unsupported positions given in a command's options are refused.
     """
 
 
@@ -114,10 +108,7 @@ class ContextLost(TransientError):
 
 
 class PanelLost(TransientError):
-    """A panel's window, monitor or GL context is lost.
-
-    The display loop keeps running and tries to rebuild the panels.
-    """
+    """A panel's window, monitor or GL context is lost. The display loop tries to rebuild the panels."""
 
 
 class Stopped(PhasestackError):
@@ -126,10 +117,7 @@ class Stopped(PhasestackError):
 
 @contextmanager
 def retry_advised() -> Iterator[None]:
-    """Convert temporary machine failures to TransientError.
-
-    The exit code for a TransientError, 75, tells the caller that starting the program again may help.
-    """
+    """Convert temporary machine failures to TransientError, whose exit code, 75, advises to start again."""
     try:
         yield
     except Exception as error:
@@ -140,7 +128,6 @@ def retry_advised() -> Iterator[None]:
 
 def is_retryable(error: BaseException | None) -> bool:
     """Return True if any exception in the chain is a temporary machine failure rather than bad input.
-
     Functions that read files convert a system error to an InputError that names the file, but the system error stays in
     the chain of causes and contexts.
     """

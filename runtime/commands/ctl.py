@@ -119,9 +119,8 @@ for _name, _meaning in PLAIN.items():
 
 
 def tell(request: dict[str, Any], config: Path | None) -> None:
-    """Send a request and print the new state. Exits with 1 if no daemon answers.
-
-    If the daemon refuses the request, raises InputError, which leads to exit code 2.
+    """Send a request and print the new state. Exits with 1 without a daemon; raises InputError if
+    refused.
     """
     from runtime.daemon.client import ANSWERED_WITHIN_S, NotRunning, ask, sockets
     from runtime.errors import InputError

@@ -81,10 +81,7 @@ def doctor(
 
 
 def _become_service() -> None:
-    """Switch to the service's user, groups and environment, but not to its sandbox.
-
-    Raises InputError if the service is not installed or if this user is not allowed to switch.
-    """
+    """Switch to the service's user, groups and environment, but not its sandbox. Raises InputError if not allowed."""
     import grp
     import pwd
     import shlex
@@ -112,10 +109,7 @@ Check = Callable[["Settings"], Iterator[Row]]
 
 
 def examine(settings: Settings) -> list[Row]:
-    """Run all checks and return the table rows.
-
-    If a check raises an unexpected exception, its row is marked as failed and the other checks still run.
-    """
+    """Run all checks and return the table rows. A check that raises an exception counts as failed."""
     rows: list[Row] = []
     for check in CHECKS:
         name = check.__name__

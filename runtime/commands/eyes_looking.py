@@ -76,16 +76,9 @@ class Watcher:
 def look_at_files(
     files: list[Path], settings: Settings, *, sequence: bool, rate_hz: float, out: Path | None
 ) -> list[Row]:
-    """Find the eyes in every frame of these files. Returns a row for each frame.
-
-    Args:
-        files: Pictures, films or recordings, in the same order as the rows.
-        sequence: True to follow the viewer from one still picture to the next.
-        rate_hz: Frame rate of still pictures.
-        out: Folder for overlays, which show the eyes found. If None, no overlays are drawn.
-
-    Raises:
-        InputError: A file cannot be read or decoded. In this case, `out` is left unchanged.
+    """Find the eyes in every frame of pictures, films or recordings, in order, and return a row for each.
+    `sequence` follows the viewer from one still picture to the next, at `rate_hz`. Overlays go to `out`, if given.
+    Raises InputError, with `out` unchanged, if a file cannot be read or decoded.
     """
     watcher, rows, follows = Watcher(settings), [], False
     with OutputFolder(out) if out is not None else nullcontext() as folder:
@@ -104,16 +97,7 @@ def look_at_files(
 
 
 def _frames(path: Path, place: int, rate_hz: float) -> Iterator[SensorFrame]:
-    """Yield all frames in a file.
-
-    Args:
-        path: A picture, film or recording.
-        place: A still picture's index in the sequence, used to compute its time.
-        rate_hz: Frame rate of still pictures.
-
-    Raises:
-        InputError: The file cannot be read or decoded.
-    """
+    """Yield all frames in a file; a still picture's time follows from its place in the sequence. Raises InputError."""
     kind = path.suffix.lower()
     if kind == RECORDING:
         for frame in Recording(path).samples():
@@ -195,15 +179,8 @@ def look_at_sensor(
     settings: Settings, report: Callable[[Row], None], *, out: Path | None, seconds: float = np.inf
 ) -> None:
     """Find the eyes in a sensor's frames until the time is up, a recording ends or Ctrl-C is pressed.
-
-    Args:
-        report: Function called with each frame's row.
-        out: Folder for the latest overlay. If None, no overlays are drawn.
-        seconds: Time limit in seconds.
-
-    Raises:
-        InputError: The sensor's settings cannot be used.
-        SensorLost: The sensor is missing or has failed.
+    `report` gets each frame's row, and `out`, if given, the latest overlay. Raises InputError for the settings, and
+    SensorLost if the sensor is missing or has failed.
     """
     watcher, driver = Watcher(settings), open_sensor(settings.sensor, MonotonicClock())
     end = time.monotonic() + seconds

@@ -21,11 +21,8 @@ INTERRUPTED, BAD_INPUT, OWN_ERROR, MAY_PASS, STDOUT_CLOSED = 130, 2, 70, 75, 141
 
 
 def run_guarded(*, interrupts_leave: bool) -> None:
-    """Run the command named on the command line, then exit the process.
-
-    Args:
-        interrupts_leave: True if Ctrl-C has ended the process immediately up to now. While the command runs, it then
-            raises KeyboardInterrupt. False leaves the handling of Ctrl-C unchanged.
+    """Run the command named on the command line, then exit the process. `interrupts_leave`: Ctrl-C has
+    ended the process immediately up to now, and raises KeyboardInterrupt in the command.
     """
     _fill_standard_descriptors()
     faulthandler.enable()  # if a library crashes, every thread's Python stack is in the log
@@ -128,10 +125,7 @@ def _say(line: str) -> None:
 
 
 def _flushed(code: int) -> int:
-    """Flush stdout and return the exit code, or an error code if flushing fails.
-
-    If this were left to Python's shutdown, a failure would print a traceback.
-    """
+    """Flush stdout and return the exit code, or that of a failure, which would print a traceback at exit."""
     try:
         sys.stdout.flush()
     except OSError as error:

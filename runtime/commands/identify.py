@@ -57,12 +57,7 @@ def identify(
 
 
 def _bound(settings: Settings) -> tuple[PanelSink, list[U8]]:
-    """Open the configured panels, and return them with a test card for each.
-
-    Raises:
-        InputError: A panel's settings cannot be used.
-        PanelLost: A monitor or the X server is missing.
-    """
+    """Open the configured panels with a test card for each. Raises InputError, or PanelLost without a monitor or X."""
     from runtime.clock import MonotonicClock
     from runtime.panels.card import identity_card
     from runtime.panels.window import WindowPanels

@@ -92,9 +92,8 @@ def record(
 
 
 def _refuse_target(out: Path, *, motion: bool) -> None:
-    """Raise InputError if a file name has the wrong suffix, or the file exists or cannot be written.
-
-    The recording of a simulated motion may be overwritten, because the same motion can be reproduced from its seed.
+    """Raise InputError if a file name has the wrong suffix, or the file exists or cannot be written. The recording of a
+    simulated motion may be overwritten, because the same motion can be reproduced from its seed.
     """
     from runtime.sensor.recording import Recording
     from runtime.support.untrusted_input import checked_path
@@ -120,16 +119,8 @@ def _refuse_target(out: Path, *, motion: bool) -> None:
 
 
 def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | None) -> dict[str, Any]:
-    """Record until Ctrl-C, a time or size limit, or the end of the source. Returns a summary.
-
-    Args:
-        out: File to write.
-        images: True to record colour and depth pictures too.
-        seconds: How long to record, in seconds. None means ten minutes.
-
-    Raises:
-        FatalError: The sensor cannot be used or does not deliver any sample.
-        InputError: The file cannot be written.
+    """Record until Ctrl-C, a limit (by default ten minutes), or the end of the source. Returns a summary.
+    Raises FatalError if the sensor cannot be used or delivers nothing, and InputError for the file.
     """
     from runtime.clock import NS_PER_S, MonotonicClock
     from runtime.eyes.detect import EyeFinder

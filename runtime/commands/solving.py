@@ -67,10 +67,7 @@ class Files:
         return self.left.name if self.right is None else f"{self.left.name} and {self.right.name}"
 
     def read(self) -> list[Any]:
-        """Read the pictures for the left and right eyes.
-
-        Raises InputError if a picture cannot be read or the two differ in size.
-        """
+        """Read the left and right eye's pictures. Raises InputError if that fails or they differ in size."""
         if self.right is None:
             return list(read_pair(self.left, with_options(Settings(), layout=self.layout).content))
         if self.layout is not None:
@@ -107,14 +104,8 @@ def asked_for(files: Files, eyes: Eyes, panels: Path | None) -> Asked:
 
 
 def case_asked_for(case: Path, others: list[str]) -> Asked:
-    """Read a case file.
-
-    Args:
-        case: The file.
-        others: Options given besides that the file replaces.
-
-    Raises:
-        InputError: The file cannot be used, or `others` is not empty.
+    """Read a case file. Raises InputError if it cannot be used, or with `others`, options that it
+    replaces.
     """
     if others:
         raise InputError("solve", others[0], "is part of the case file; omit it, or omit --case")
@@ -133,9 +124,8 @@ def solve_pictures(
     backend: str | None,
     plan: bool,
 ) -> dict[str, Any]:
-    """Solve pictures, write the layers and the eyes' views, and return the contents of solve.json.
-
-    Raises InputError if an option or the given eye positions cannot be used.
+    """Solve pictures, write the layers and the eyes' views, and return the contents of solve.json. Raises
+    InputError if an option or the given eye positions cannot be used.
     """
     pictures, stack, eyes_m, fov_deg = asked.pictures, asked.stack, asked.eyes_m, asked.fov_deg
     settings = with_options(Settings(), model=model, backend=backend).model
@@ -214,21 +204,9 @@ def solve_pictures(
 
 
 def taken(pictures: list[Any], eyes: Eyes, stack: PanelStack) -> tuple[list[Any], F64, float]:
-    """Return the pictures as if taken by eyes that look at the stack's origin.
-
-    Pictures taken by other cameras (--camera) are resampled.
-
-    Args:
-        pictures: Pictures for the left and right eyes.
-        eyes: The eyes or cameras that took the pictures.
-        stack: Panels to solve for.
-
-    Returns:
-        The pictures, the eyes (2, 3) in metres in the stack frame, and the pictures' horizontal field of view in
-        degrees.
-
-    Raises:
-        InputError: The eyes or cameras are missing, invalid or given twice.
+    """Return the pictures as if taken by eyes that look at the stack's origin, the eyes (2, 3), and the
+    fov_deg. Pictures of other cameras (--camera) are resampled. Raises InputError if eyes or cameras are missing,
+    invalid or given twice.
     """
     if eyes.cameras is None:
         if eyes.left is None or eyes.right is None:
@@ -249,9 +227,8 @@ def taken(pictures: list[Any], eyes: Eyes, stack: PanelStack) -> tuple[list[Any]
 
 
 def checked_eyes(left_eye: tuple[float, ...], right_eye: tuple[float, ...], stack: PanelStack) -> F64:
-    """Return the eyes as a (2, 3) array, in metres in the stack frame.
-
-    Raises InputError if either eye is not in front of the panels or if the two are too close together.
+    """Return the eyes (2, 3). Raises InputError if they are not in front of the panels, or too close
+    together.
     """
     for option, eye in (("--left-eye", left_eye), ("--right-eye", right_eye)):
         if eye[0] <= max(stack.x_m):

@@ -47,16 +47,9 @@ def settings_of(
 
 
 def try_display(settings: Settings, *, port: int, opens: bool, seconds: float | None, as_json: bool) -> None:
-    """Serve the page and run the daemon until it is stopped.
-
-    Args:
-        port: Port to listen on. 0 picks a free one.
-        opens: True to open the page in a browser if there is a graphical session.
-        seconds: Time limit in seconds, or None for no limit.
-        as_json: True to print the page's address as a JSON object.
-
-    Raises:
-        InputError: The port is already in use, or the settings cannot be used.
+    """Serve the page on a port (0: any) and run the daemon until it is stopped or after `seconds`.
+    `opens` opens the page in a browser if there is a graphical session; `as_json` prints its address as JSON. Raises
+    InputError if the port is in use, or for the settings.
     """
     is_sensor = settings.sensor.driver == "browser"
     link = BrowserLink(settings.stack.stack(), settings.content.fov_deg, is_sensor=is_sensor)
@@ -87,10 +80,7 @@ def _as_it_is(settings: Settings) -> Settings:
 
 
 def _as_wished(settings: Settings, link: BrowserLink) -> Settings:
-    """Return the settings with the gap chosen on the page, and with the current scene and model.
-
-    If the camera has been switched on or off on the page, the link is also updated.
-    """
+    """Return the settings with the page's gap and the current scene and model, and update the link's camera."""
     wishes, link.wishes = link.wishes, {}
     account = link.shown[1]
     settings = with_options(settings, scene=account.get("scene"), model=account.get("model"))

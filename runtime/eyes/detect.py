@@ -81,13 +81,8 @@ class EyeFinder:
         return self._first.find(frame, taken=self._faces_except(self._first))
 
     def find_all(self, frame: SensorFrame, *, is_still: bool = False) -> tuple[EyePoints, ...]:
-        """Return all people's eyes, nearest first, in the sensor frame.
-
-        Apart from the viewer, a face counts as a person only once it has moved or blinked.
-
-        Args:
-            frame: Sample as for `find`.
-            is_still: True for a picture without predecessors, in which no face can show signs of life.
+        """Return all people's eyes, nearest first, in the sensor frame. Apart from the viewer, a face counts
+        as a person only once it has moved or blinked, or if `is_still`, in a picture without predecessors.
         """
         found = [self.find(frame)]
         for follower in self._others:

@@ -120,11 +120,8 @@ def true_eyes(motion: str, times_s: F64, *, path: Path = BENCHMARK_PATH) -> F64:
 
 
 def facing_eyes(middle_m: F64, *, roll: F64) -> F64:
-    """Return the (n, 2, 3) eyes of heads that face the display.
-
-    Args:
-        middle_m: (n, 3) midpoints of the eyes, in frame `stack`.
-        roll: (n,) tilts of the heads in radians.
+    """Return the (n, 2, 3) eyes of heads that face the display, of midpoints (n, 3) and tilts (n,) in
+    rad.
     """
     yaw = np.arctan2(middle_m[:, 1], middle_m[:, 0])
     across = [-np.sin(yaw) * np.cos(roll), np.cos(yaw) * np.cos(roll), np.sin(roll)]
@@ -173,10 +170,6 @@ def measured(true_m: F64, random: np.random.Generator, *, noise_m: float, outlie
 
 
 def dropouts(times_s: F64, *, every_s: float) -> NDArray[np.bool_]:
-    """Return, for each of (n,) times, True if the sensor sees no face.
-
-    Args:
-        every_s: Time between dropouts. If 0, there are none.
-    """
+    """Return, for each of (n,) times, True if the sensor sees no face. `every_s` is 0 for no dropouts."""
     every_s = every_s or np.inf
     return np.asarray((times_s > 1.0) & (np.mod(times_s, every_s) >= every_s - DROPOUT_S))

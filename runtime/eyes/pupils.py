@@ -109,10 +109,8 @@ class PupilFinder:
     """
 
     def __init__(self, *, lock_ns: int = 0, shares: PupilFinder | None = None) -> None:
-        """Create a finder. After `lock_ns`, a viewer who is no longer seen may be replaced by another person.
-
-        Args:
-            shares: Finder of another person whose networks to use.
+        """Create a finder, which may use another finder's networks. After `lock_ns`, a viewer who is no longer seen may
+        be replaced by another person.
         """
         self._faces: FaceNetwork = shares._faces if shares else FaceNetwork()
         self._meshes: MeshNetwork = shares._meshes if shares else MeshNetwork()

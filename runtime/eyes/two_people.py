@@ -104,10 +104,9 @@ MOTIONS_OF_TWO: dict[str, MotionOfTwo] = {
 
 
 def true_eyes_of_two(motion: str, times_s: F64) -> F64:
-    """Return the (n, 4, 3) eyes of two people during a motion, in metres, in frame `stack`.
-
-    The first two are the first person's left and right eye. A person who is outside the sensor's field of view counts
-    as absent and has NaN coordinates.
+    """Return the (n, 4, 3) eyes of two people during a motion, in metres, in frame `stack`. The first two
+    are the first person's left and right eye. A person who is outside the sensor's field of view counts as absent and
+    has NaN coordinates.
     """
     middles, rolls = MOTIONS_OF_TWO[motion](times_s)
     eyes = np.stack([facing_eyes(middle, roll=roll) for middle, roll in zip(middles, rolls, strict=True)], 1)
@@ -141,16 +140,8 @@ def observe_two(
     dropout_every_s: float = 4.0,
     seed: int = 1,
 ) -> list[SensorFrame]:
-    """Simulate the samples taken by a sensor while two people move, with their true eyes.
-
-    Eye points are in frame `stack`. A person whom the other one hides is missing from a sample.
-
-    Args:
-        motion: Name of a motion in `MOTIONS_OF_TWO`.
-        noise_m: Standard deviation of the noise for each eye along each axis.
-        outliers: Share of outliers among each person's samples (`motions.observe`).
-        dropout_every_s: Time between dropouts, in which no face is seen. If 0, there are none.
-        seed: Seed for the noise and the outliers.
+    """Simulate the samples taken by a sensor during one of `MOTIONS_OF_TWO`, with true eyes, in `stack`.
+    A person whom the other one hides is missing from a sample. The other arguments are those of `motions.observe`.
     """
     random = np.random.default_rng([seed, *motion.encode(), round(rate_hz)])
     times_s = np.arange(round(seconds * rate_hz)) / rate_hz

@@ -33,14 +33,9 @@ class FocusCamera:
     fov_deg: float
 
     def projection(self, eye_m: F64, point_m: F64, *, focus_m: float) -> F64:
-        """Return the 3x4 projection matrix through a point in the pupil, refocused to a given distance.
-
-        The third homogeneous coordinate of a projected point is its distance from the eye along the gaze, in metres.
-
-        Args:
-            eye_m: The pupil's centre, shape (3,), in the `stack` frame.
-            point_m: Offset from the pupil's centre, to the right and up, shape (2,).
-            focus_m: Distance along the gaze at which the pictures through all points coincide.
+        """Return the 3x4 projection through a point (right, up) of the pupil, refocused to `focus_m` along
+        the gaze. The third homogeneous coordinate of a projected point is its distance from the eye along the gaze, in
+        metres.
         """
         centre = image_from_stack(eye_m, width_px=self.width_px, height_px=self.height_px, fov_deg=self.fov_deg)
         # As the pupil's point moves, points in front of the plane in focus move the opposite way, and points behind it
@@ -60,12 +55,8 @@ class FocusCamera:
         return seen.image
 
     def focused(self, eye_m: F64, picture_of: Callable[[F64], F32], *, plane_m: float) -> F32:
-        """Return the (h, w, 3) retina picture of an eye that focuses on the point (`plane_m`, 0, 0).
-
-        Args:
-            eye_m: The pupil's centre, shape (3,), in the `stack` frame.
-            picture_of: Function that returns the picture through a projection.
-            plane_m: x of the point, in the `stack` frame.
+        """Return the (h, w, 3) retina picture of an eye that focuses on the point (`plane_m`, 0, 0) in
+        `stack`. `picture_of` returns the picture through a projection.
         """
         gaze = -stack_from_eye(eye_m)[:3, 2]
         focus_m = float((np.array([plane_m, 0.0, 0.0]) - eye_m) @ gaze)
@@ -74,12 +65,8 @@ class FocusCamera:
 
 
 def retina_db(pictures: Iterable[tuple[F32, F32]]) -> float:
-    """Return the PSNR of retina pictures against those of the scene itself.
-
-    The PSNR is of one mean squared error over all pictures: both eyes, each focused at three distances.
-
-    Args:
-        pictures: For each eye and distance, the picture seen and the scene's own, (h, w, 3) intensities.
+    """Return the PSNR, of one mean squared error, of (h, w, 3) retina pictures against the scene's own.
+    There is a pair of pictures for each eye and each of three distances.
     """
     total, counted = 0.0, 0
     for seen, true in pictures:
@@ -91,10 +78,6 @@ def retina_db(pictures: Iterable[tuple[F32, F32]]) -> float:
 
 
 def points_of_pupils(eyes_m: Eyes) -> F64:
-    """Return the points of each pupil that get separate pictures when content is solved for focus.
-
-    Returns:
-        (2V, 3) positions, which list all eyes for each point in turn.
-    """
+    """Return the (2V, 3) points of pupils that get separate pictures for focus: all eyes for each point."""
     right, up = stack_from_eye(eyes_m.mean(axis=0))[:3, 0], np.array([0.0, 0.0, 1.0])
     return np.concatenate([eyes_m + across_m * right + up_m * up for across_m, up_m in SOLVED_POINTS_M])

@@ -185,8 +185,8 @@ def read_text(path: str | Path, *, most_bytes: int = JSON_BYTES_MAX) -> str:
 
 
 def decoded(data: bytes, *, source: str | Path) -> str:
-    """Decode UTF-8 text, or UTF-16 with a byte-order mark as some Windows programs save it, and drop the mark. Raises
-    InputError if the data are neither.
+    """Decode UTF-8 text, or UTF-16 with a byte-order mark as some Windows programs save it, and drop the
+    mark. Raises InputError if the data are neither.
     """
     try:
         return data.decode("utf-16" if data.startswith((BOM_UTF16_LE, BOM_UTF16_BE)) else "utf-8-sig")
