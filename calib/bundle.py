@@ -1,12 +1,9 @@
 """Estimate every panel's pose by bundle adjustment, together with one camera's lens and poses.
 
 The panels' known pixel pitch sets the scale. The reference panel is fixed at its ideal pose and defines the stack's
-frame; every other panel has six degrees of freedom. A robust fit (soft L1) first identifies outliers, and ordinary
-least squares on the remaining points then gives an unbiased covariance.
-
-The derivatives are exact. The normal equations are small: about a hundred unknowns for thousands of coordinates.
-SciPy's `least_squares` gives the same covariance (to 1e-11) but takes 30 times as long, because it decomposes the
-entire Jacobian.
+frame; every other panel has six degrees of freedom. A robust fit (soft L1) identifies outliers, and ordinary least
+squares on the other points gives an unbiased covariance. SciPy's `least_squares` gives the same covariance (to 1e-11)
+but takes 30 times as long, because it decomposes the entire Jacobian.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
-"""Draw calibration charts with black lines at the thirds of each eye's image (EyeReal, 2.3, S4).
+"""Calibration charts with black lines at the thirds of each eye's image (EyeReal, 2.3, S4).
 
-A chart's layers show both eyes the same lines. For a person whose eyes are at the chart's viewpoint, the lines fuse
-into clean single lines. From any other position, ghosts and stripes are visible.
+For eyes at the chart's viewpoint, the lines fuse into clean single lines. Elsewhere, ghosts and stripes are visible.
 """
 
 from __future__ import annotations

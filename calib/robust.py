@@ -1,8 +1,7 @@
 """Fit a similarity to pairs of points, some of which may have gross errors.
 
-Least trimmed squares (Rousseeuw 1984) with concentration steps (FAST-LTS, Rousseeuw & Van Driessen 1999) finds the half
-of the pairs that agree best. The noise is estimated from this half, and pairs whose errors are much larger are
-rejected.
+FAST-LTS (Rousseeuw & Van Driessen 1999) finds the half of the pairs that agree best. The noise is estimated from this
+half, and pairs with much larger errors are rejected.
 """
 
 from __future__ import annotations

@@ -1,15 +1,10 @@
 """Fit a similarity to pairs of points in closed form (EyeReal supplement, (19)-(27)).
 
 A similarity maps a point c in the `sensor` frame to the point w = s·R·c + t in the `stack` frame. The rotation
-maximises the correlation of the centred points (Kabsch, Umeyama 1991). The scale depends on a rule:
-
-* `seed` is the ratio of the RMS radii (EyeReal, (22)), which is the geometric mean of the next two scales listed.
-* `least-squares` minimises the error in the stack frame (EyeReal, (20), Umeyama). Sensor noise makes this scale too
-  small.
-* `inverse` minimises the error in the sensor frame: the similarity is fitted from the stack to the sensor, then
-  inverted. This scale is consistent if the stack's points are exact and the sensor's points are noisy, as in a
-  calibration.
-* A number is used as the known scale.
+maximises the correlation of the centred points (Kabsch, Umeyama 1991). The scale is known, or depends on a rule
+(docs/calibration.md): `least-squares` minimises the error in the stack frame (EyeReal, (20)), so that sensor noise
+makes it too small; `inverse` minimises it in the sensor frame, which is consistent if only the sensor's points are
+noisy; `seed`, the ratio of the RMS radii (22), is the geometric mean of both.
 """
 
 from __future__ import annotations

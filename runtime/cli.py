@@ -1,8 +1,7 @@
 """Entry point of the `phasestack` command, which installs an early handler for Ctrl-C.
 
-While the commands are being imported, Ctrl-C exits the process silently with code 130. This is safe because no file is
-open yet. An exception would print a traceback, or would be lost where Python ignores exceptions. Once the commands are
-imported, `commands.guard` handles interrupts.
+While the commands are being imported, Ctrl-C exits the process silently with code 130; no file is open yet. An
+exception would print a traceback, or be lost where Python ignores it. Then `commands.guard` handles interrupts.
 """
 
 # These modules are already loaded; importing `signal` would delay the handler by milliseconds.

@@ -1,7 +1,6 @@
 """Play a list of scenes one after another, each with a duration and settings.
 
-All scenes are loaded before the first one is shown, so missing files are reported at the start, and changing to the
-next scene takes no time.
+All are loaded before the first one is shown, so missing files are reported at the start, and changes take no time.
 """
 
 from __future__ import annotations

@@ -1,7 +1,5 @@
-"""Draw textured, coloured and lit triangles with OpenGL.
-
-Each part's shaders are compiled with only the features that the part needs, such as a lamp, a texture or vertex
-colours.
+"""Draw textured, coloured and lit triangles with OpenGL, by shaders with only the features each part
+needs.
 """
 
 from __future__ import annotations

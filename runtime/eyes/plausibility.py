@@ -1,7 +1,5 @@
-"""Detect points that cannot be eyes, such as points in millimetres or behind the display.
-
-Nothing in this module reads a clock. Eyes are in metres in frame `stack`, with axes that point out of the screen (+x),
-to the viewer's right (+y) and up (+z).
+"""Detect points that cannot be eyes, such as points in millimetres or behind the display, without a
+clock.
 """
 
 from __future__ import annotations

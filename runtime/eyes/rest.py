@@ -1,8 +1,7 @@
 """Detect a head at rest from the samples accepted by the tracker.
 
-The tracker's predictions jitter by several times the sensor's noise, because predicting ahead amplifies noise in the
-estimated velocity. While the head is at rest, the best estimate of its position is the median of the samples, and the
-picture can stand still.
+Predictions jitter by several times the sensor's noise, because predicting ahead amplifies noise in the velocity. At
+rest, the best estimate of the position is the samples' median, and the picture can stand still.
 """
 
 from __future__ import annotations

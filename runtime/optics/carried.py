@@ -1,10 +1,8 @@
 """Carried, expected and light quality of layers seen from eye positions they were not solved for.
 
-The three measures are defined in docs/contracts.md. They treat the picture that the layers were solved for as if it
-were painted on the centre panel: each pixel's ray is replaced by the ray from the true eye through the same point on
-the centre panel. Ghosts and colour fringes count as errors. Parallax between the nominal and the true eye does not
-count, because no shift of the layers can add it. Neither does the age of the view; the error that it causes is measured
-by `evaluation.refresh_quality`.
+docs/contracts.md defines these measures. Ghosts and colour fringes count as errors. Parallax between the nominal and
+the true eye does not count, because no shift of the layers can add it. Neither does the age of the view, which
+`evaluation.refresh_quality` measures.
 """
 
 from __future__ import annotations

@@ -1,13 +1,9 @@
 """Mean squared error of the light that reaches the eyes through the displayed layers.
 
-The terms are defined in docs/contracts.md, section "Error". The error can be measured in two ways:
-
-* *Light*, the figure to quote, models each panel pixel as a square of uniform colour. A pixel in the eye's picture
-  receives the mean intensity over its area and over the pupil, which is focused on the centre panel. This mean is
-  estimated from two independent sets of random rays. The squared error is estimated without bias as the mean product of
-  the two sets' errors; the mean square of a single set's errors would include the variance of the rays.
-* *One ray*, the measure used in published evaluations, traces a single ray through the centres of the pixel and the
-  pupil, and samples the panels bilinearly.
+docs/contracts.md ("Error") defines it. *Light*, the figure to quote, is the mean over the pixel and the pupil,
+estimated from two independent sets of random rays: the mean product of the two sets' errors is unbiased, whereas a
+single set's mean square would include the variance of the rays. *One ray*, as in published evaluations, goes through
+the centres of the pixel and the pupil, and samples the panels bilinearly.
 """
 
 from __future__ import annotations

@@ -1,7 +1,5 @@
-"""The part of a panel's picture that a solution fills.
-
-Beyond a scene's content, layers have the rest code. There, a panel's picture stays the same from frame to frame, and is
-neither drawn nor copied.
+"""The part of a panel's picture that a solution fills; the rest code around it is neither drawn nor
+copied.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Crosstalk between the eyes, luminance uniformity and viewing freedom, on ideal panels.
 
-Crosstalk is (L_dark - L_black) / (L_bright - L_black): one eye should see a white patch, the other eye black (Woods, J.
-Electron. Imaging 21 (2012) 040902). Standards measure it with patches that fill the display (IEC 62629-22-1; IDMS of
-the ICDM, stereoscopic chapters). Here L_black is 0, because the panels are ideal.
+Crosstalk is L_dark / L_bright (the black level is 0): one eye should see a white patch, the other eye black (Woods, J.
+Electron. Imaging 21 (2012) 040902). Standards measure it with patches that fill the display (IEC 62629-22-1; IDMS).
 """
 
 from __future__ import annotations

@@ -1,8 +1,4 @@
-"""Measure live quality for moving viewers in simulated runs, with fixed and with automatic efforts.
-
-An effort is a raster and a number of steps, which together determine how long a solution takes. Unless the effort is
-fixed, the runtime chooses one for each solution.
-"""
+"""Measure live quality for moving viewers in simulated runs, with fixed and with automatic efforts."""
 
 from __future__ import annotations
 

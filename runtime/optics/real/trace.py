@@ -1,7 +1,7 @@
-"""Rays through real panels: where they cross each panel, and how much light they carry.
+"""Rays through real panels, traced from the eye to the backlight: where they cross panels, and their
+light.
 
-Rays are traced backwards, from the eye through the front panel to the backlight. The directions in which panels scatter
-light are drawn at random.
+The directions in which panels scatter light are drawn at random.
 """
 
 from __future__ import annotations

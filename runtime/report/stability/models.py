@@ -1,12 +1,9 @@
 """Cases that test the models on stiff problems, and on extreme pictures, poses and sizes.
 
-The stiff part of the two-eye problem is the lowest frequency of the difference between the eyes: one cycle across the
-panels, which the outer panels must carry through their parallax. Its eigenvalue is 3 - |1 + exp(2iks_0) + exp(2iks_2)|.
+The stiff part of the two-eye problem (docs/mathematics.md) is the lowest frequency of the difference between the eyes.
 The target contains that wave, finer waves, and a part common to both eyes that any panel can show. This module traces
 rays through a model's panels and compares the residual with that of the exact least-squares solution within the panels'
-range (scipy). Neither computation shares code with the models.
-
-The other problems have no closed-form solution. Their errors are compared with recorded ones.
+range (scipy). Neither shares code with the models. Errors of other problems are compared with recorded ones.
 """
 
 from __future__ import annotations
