@@ -61,6 +61,16 @@ def place(
         float | None,
         number(-600, 600, help="rotation speed about the vertical axis in turns per minute (0 to stop it)"),
     ] = None,
+    convergence: Annotated[
+        float | None,
+        number(-0.1, 0.1, "m", help="distance in metres between a stereo picture's views (positive: farther away)"),
+    ] = None,
+    comfort: Annotated[
+        float | None,
+        number(
+            0, 10, "degrees", help="largest angle by which a live stereo picture's depth may differ from the display"
+        ),
+    ] = None,
     reset: Annotated[bool, typer.Option("--reset", help="restore the configured placement")] = False,
     config: Config = None,
 ) -> None:
@@ -73,11 +83,10 @@ def place(
     from runtime.errors import InputError
 
     options = {"scale": scale, "offset_m": offset, "rotation_deg": rotate, "turntable_per_min": turntable}
+    options |= {"convergence_m": convergence, "comfort_deg": comfort}
     value = {name: option for name, option in options.items() if option is not None}
     if reset == bool(value):
-        raise InputError(
-            "ctl place", "", "pass either --reset, or at least one of --scale, --offset, --rotate and --turntable"
-        )
+        raise InputError("ctl place", "", "pass either --reset, or at least one other option, such as --scale")
     tell({"command": "place", "value": None if reset else value}, config)
 
 

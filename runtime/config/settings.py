@@ -274,6 +274,16 @@ class ContentSettings(Section):
         description="rotations of the scene about the axes that point out of the screen, right and up, applied in "
         "that order",
     )
+    convergence_m: Annotated[float, within(-0.1, 0.1, "m")] = Field(
+        0.0,
+        description="distance in metres by which a stereo picture's right view is moved to the right of its left view "
+        "(positive: farther away)",
+    )
+    comfort_deg: Annotated[float, within(0.0, 10.0, "degrees")] = Field(
+        0.0,
+        description="largest angle by which the depth of a `window` or `pipe` may differ from the display's; its views "
+        "are moved, and made smaller if necessary (0 for no limit)",
+    )
     turntable_per_min: Annotated[float, within(-600.0, 600.0, "turns per minute")] = Field(
         0.0,
         description="rotation speed about the vertical axis in turns per minute (negative for clockwise as seen "

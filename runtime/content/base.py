@@ -55,6 +55,7 @@ class ContentSource(ABC):
 
     Options: ClassVar[type[BaseModel]] = Section  # model that validates [content.options] for a user-defined scene
     info: ContentInfo
+    comfort_deg: float = 0.0  # limit for the depth of live stereo pictures; 0 for none
     draws_in: object = None  # GL context that owns the textures `draw` returns, or None if the source returns arrays
 
     def __init__(self, options: Any, *, stack: Any, context: Any) -> None:

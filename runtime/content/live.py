@@ -12,18 +12,23 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from runtime.config import ContentSettings
+from runtime.content import comfort
 from runtime.content.base import ContentInfo, ContentSource, View
 from runtime.content.images import WarpedPicture, plane_from_pixels, rgba_from_rgb
 from runtime.content.layout import MONO, Layout, hint, layout_of, of_film
 from runtime.content.pictures import screen
 from runtime.content.placing import SceneFile
 from runtime.errors import ContentFailure
-from runtime.records import U8
+from runtime.records import F64, U8
 from runtime.support.background import begin
 
 FROZEN_S = 2.0  # a feed counts as frozen after this time without a picture
 CLOSES_WITHIN_S = 2.0
+MEASURED_EVERY = 3  # pictures after which the depth of a live picture is measured again
+FOLLOWS = 0.2  # weight of a new measurement of the depth
 LOOKED_AT_EVERY = 30  # pictures after which a flat feed is checked again for two views
 
 
@@ -86,6 +91,8 @@ class LiveSource(ContentSource):
         self._at = 0
         self._views: list[U8] = []
         self._shown: dict[int, WarpedPicture] = {}
+        self._depths: tuple[float, float] | None = None  # farthest and nearest disparity, as fractions of the width
+        self._measured = 0  # number of the picture whose depth was measured last
         self._layout: tuple[tuple[int, ...], int, Layout] = ((), 0, MONO)  # a picture's shape, number and layout
         feed.start()
 
@@ -102,7 +109,27 @@ class LiveSource(ContentSource):
         which = min(view.side, len(self._views) - 1)
         if which not in self._shown:
             self._shown[which] = WarpedPicture(rgba_from_rgb(self._views[which]), background=self._file.background)
-        return self._shown[which].warped(plane_from_pixels(view.pixels_from_stack, self._screen), view)
+        return self._shown[which].warped(self._picture_from_view(view), view)
+
+    def _picture_from_view(self, view: View) -> F64 | None:
+        """Return the homography from a view's pixels to those of the picture, which stands where it is comfortable."""
+        plane_from_view = plane_from_pixels(view.pixels_from_stack, self._screen)
+        if plane_from_view is None or not self.comfort_deg or self._depths is None or len(self._views) < 2:
+            return plane_from_view
+        width_m = self._screen.width_px * self._screen.pitch_u_m
+        most_m = np.radians(self.comfort_deg) * max(view.eye_m[0], 0.0)
+        far, near = self._depths
+        shift_m, scale = comfort.adjusted(far * width_m, near * width_m, most_m)
+        middle = self._screen.width_px / 2, self._screen.height_px / 2
+        moved_px = (view.side - 0.5) * shift_m / self._screen.pitch_u_m
+        picture_from_plane = np.array(
+            [
+                [1 / scale, 0, middle[0] - (middle[0] + moved_px) / scale],
+                [0, 1 / scale, middle[1] * (1 - 1 / scale)],
+                [0, 0, 1],
+            ]
+        )
+        return np.asarray(picture_from_plane @ plane_from_view)
 
     def expect(self, views: Any, *, time_ns: int) -> None:
         """Take the newest picture, unless the next view is the same pair's second one."""
@@ -121,6 +148,20 @@ class LiveSource(ContentSource):
         aspect = layout.pixel_aspect(width_px=width, height_px=height)
         self._screen = screen(self._file.stack, width_px=width, height_px=height, pixel_aspect=aspect)
         self._views, self._at, self._shown = parts, newest.number, {}
+        self._measure()
+
+    def _measure(self) -> None:
+        """Follow the depth of the views, if it is limited."""
+        if not self.comfort_deg or len(self._views) != 2:
+            self._depths = None
+            return
+        if self._depths is not None and self._at < self._measured + MEASURED_EVERY:
+            return
+        found, self._measured = comfort.disparities(*self._views), self._at
+        if found is not None and self._depths is not None:
+            far, near = ((1 - FOLLOWS) * old + FOLLOWS * new for old, new in zip(self._depths, found))
+            found = far, near
+        self._depths = found or self._depths
 
     def _layout_for(self, picture: LivePicture) -> Layout:
         """Return the layout that the settings state, or the one that a picture of a new size seems to have."""

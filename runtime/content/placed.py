@@ -17,7 +17,14 @@ from runtime.content.base import ContentInfo, ContentSource, ForwardingSource, V
 from runtime.content.presets import rotation_matrix
 from runtime.records import F64
 
-FIELDS = ("scale", "offset_m", "rotation_deg", "turntable_per_min")  # fields of ContentSettings
+FIELDS = (
+    "scale",
+    "offset_m",
+    "rotation_deg",
+    "turntable_per_min",
+    "convergence_m",
+    "comfort_deg",
+)  # fields of ContentSettings
 NS_PER_MIN = 60 * NS_PER_S
 
 
@@ -29,6 +36,8 @@ class Placing:
     offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # frame `stack`
     rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)  # about the fixed axes x, y and z, in this order
     turntable_per_min: float = 0.0  # revolutions about the vertical axis
+    convergence_m: float = 0.0  # how far the right view is moved to the right of the left one
+    comfort_deg: float = 0.0  # limit for the depth of live stereo pictures; 0 for none
 
     def rotation(self, time_ns: int) -> F64:
         """Return the 3x3 rotation from the scene's frame to `stack` at a given time."""
@@ -47,13 +56,21 @@ class Placing:
 
 def placing_of(settings: ContentSettings) -> Placing:
     """Return the placement specified by the settings."""
-    return Placing(settings.scale, settings.offset_m, settings.rotation_deg, settings.turntable_per_min)
+    return Placing(
+        settings.scale,
+        settings.offset_m,
+        settings.rotation_deg,
+        settings.turntable_per_min,
+        settings.convergence_m,
+        settings.comfort_deg,
+    )
 
 
 def placed_source(source: ContentSource, placing: Placing) -> ContentSource:
     """Return a source that shows `source` with a placement that replaces any earlier one."""
     if isinstance(source, PlacedSource):
         source = source.source
+    source.comfort_deg = placing.comfort_deg
     return source if placing == Placing() else PlacedSource(source, placing)
 
 
@@ -72,6 +89,7 @@ class PlacedSource(ForwardingSource):
     def forwarded(self, view: View, time_ns: int) -> tuple[ContentSource, View, int]:
         """Return the source and the time unchanged, and the view transformed to the scene's frame."""
         matrix = self.placing.stack_from_scene(time_ns)
+        matrix[1, 3] += (view.side - 0.5) * self.placing.convergence_m
         turn = matrix[:3, :3] / self.placing.scale
         eye = turn.T @ (view.eye_m - matrix[:3, 3]) / self.placing.scale
         lit = turn if view.display_from_view is None else view.display_from_view @ turn
@@ -95,5 +113,5 @@ class PlacedSource(ForwardingSource):
 def _moved(info: ContentInfo, placing: Placing) -> ContentInfo:
     still = not placing.turntable_per_min
     # A flat scene stays flat only if it remains in the middle panel's plane.
-    is_flat = still and placing.rotation_deg[1:] == (0.0, 0.0) and placing.offset_m[0] == 0.0
+    is_flat = still and placing.rotation_deg[1:] == (0.0, 0.0) and placing.offset_m[0] == placing.convergence_m == 0.0
     return replace(info, moving=info.moving or not still, flat_x_m=info.flat_x_m if is_flat else None)

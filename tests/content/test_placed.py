@@ -42,6 +42,17 @@ def test_an_offset_moves_it_to_where_the_projection_says(context: Any, stack: Pa
     assert np.abs(there - expected).max() < 2.5
 
 
+def test_convergence_moves_the_views_apart_by_itself(context: Any, stack: PanelStack) -> None:
+    views = [panel_view(EYE, stack.panel(1), side=side) for side in (0, 1)]
+    places = []
+    for convergence_m in (0.0, 0.02):
+        source = open_content(ContentSettings(scene="sparse", convergence_m=convergence_m), stack, context)
+        places.append([middle_of(source.render(view, time_ns=0).copy()) for view in views])
+        source.close()
+    apart = (np.array(places[1]) - places[0])[:, 0] * stack.width_m / stack.width_px
+    assert apart == pytest.approx([-0.01, 0.01], abs=0.001)
+
+
 def test_scale_is_about_the_displays_middle(context: Any, stack: PanelStack) -> None:
     small, large = (drawn(context, stack, scale=scale) for scale in (0.5, 1.5))
     areas = [(picture[..., 3] == 255).sum() for picture in (small, large)]

@@ -31,6 +31,7 @@ def test_a_scene_is_moved_at_once_and_put_back(tmp_path: Path) -> None:
         assert served.asked("place", {"turntable_per_min": 6.0})["ok"]
         assert served.status()["placing"] == {
             "scale": 1.5, "offset_m": [0.0, 0.1, 0.0], "rotation_deg": [0.0, 0.0, 0.0], "turntable_per_min": 6.0,
+            "convergence_m": 0.0, "comfort_deg": 0.0,
         }  # fmt: skip
         assert served.asked("place", None)["ok"]
         assert served.status()["placing"]["scale"] == 1.0 and not served.rig.content.info.moving

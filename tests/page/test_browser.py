@@ -134,7 +134,10 @@ def test_scenes_log_and_states_are_listed(tried: dict[str, Any]) -> None:
 def test_every_control_is_reached_by_the_keyboard(tried: dict[str, Any]) -> None:
     wanted = {"pause", "flat", "resume", "reload", "blackbox", "scene", "Show scene"}
     wanted |= {"model", "Use model", "place-reset"}
-    wanted |= {f"p-{name}" for name in ("scale", "turntable", "out", "right", "up", "roll", "pitch", "yaw")}
+    wanted |= {
+        f"p-{name}"
+        for name in ("scale", "turntable", "out", "right", "up", "roll", "pitch", "yaw", "convergence", "comfort")
+    }
     assert wanted <= set(tried["reached by tab"])
 
 

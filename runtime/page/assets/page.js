@@ -244,6 +244,7 @@ const PLACE = [
   ["p-scale", "scale", null, 1], ["p-turntable", "turntable_per_min", null, 1],
   ["p-out", "offset_m", 0, 1000], ["p-right", "offset_m", 1, 1000], ["p-up", "offset_m", 2, 1000],
   ["p-roll", "rotation_deg", 0, 1], ["p-pitch", "rotation_deg", 1, 1], ["p-yaw", "rotation_deg", 2, 1],
+  ["p-convergence", "convergence_m", null, 1000], ["p-comfort", "comfort_deg", null, 1],
 ];
 let placed = null, waiting = null, sending = false;
 
