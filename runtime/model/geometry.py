@@ -103,25 +103,29 @@ class Geometry:
         return tuple(box.cut(self.stack.panel(n)) for n, box in enumerate(self.boxes))
 
     def ray_sets(self, places: Places, eye_sigma_m: float) -> RaySets:
-        """Return one step's ray sets: every view at 1 or 2 head positions, which take turns. If the views
-        belong to several points of each pupil, these take turns too, so that a step costs the same. The tracking
-        error's `eye_sigma_m` is limited so that all assumed eyes are in front of the panels.
+        """Return one step's ray sets: every view at 1 or 2 head positions, which take turns. The tracking error's
+        `eye_sigma_m` is limited so that all assumed eyes are in front of the panels.
+
+        Points of a pupil are seen from the tracked head position alone. They are as far apart as a good tracker's
+        errors, so a point that errs would ask for its neighbour's rays to show the point's own picture. A step takes
+        the first point and half of the others: `rising` steps the first half, all other steps the second.
         """
+        if self.points > 1:
+            half, each = (self.points - 1) // 2 + 1, len(self.eyes_m) // self.points
+            others = range(1, half) if places == "rising" else range(half, self.points)
+            return self._sets(
+                [[point * each + view for point in (0, *others) for view in range(each)]], np.zeros((1, 2))
+            )
         eye_sigma_m = self._possible_m(eye_sigma_m)
         sure = self.rays.height_px == 1 or self._moved_px(eye_sigma_m) < KNOWN_PX
         positions = PLACES["middle" if sure else places]
-        if self.points == 1:
-            turns = [range(len(self.eyes_m))] * len(positions)
-        else:
-            each, first = len(self.eyes_m) // self.points, int(places == "falling")
-            turns = [range(p * each, (p + 1) * each) for p in np.roll(range(self.points), first).tolist()]
-        return self._sets(turns, eye_sigma_m * np.array([positions[n % len(positions)] for n in range(len(turns))]))
+        return self._sets([range(len(self.eyes_m))] * len(positions), eye_sigma_m * np.array(positions))
 
     def closing_sets(self) -> RaySets:
         """Return the ray sets for closing the middle panel: every view's rays, without tracking error."""
         return self._sets([range(len(self.eyes_m))], np.zeros((1, 2)))
 
-    def _sets(self, shown: Sequence[range], moved_m: F64) -> RaySets:
+    def _sets(self, shown: Sequence[Sequence[int]], moved_m: F64) -> RaySets:
         """Return ray sets, given, for each turn, its views and the head's distance (right, up) from the tracked
         position.
         """

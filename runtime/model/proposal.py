@@ -99,7 +99,7 @@ class ChainProposal:
             raise EyesNotServed(str(error)) from None
         middle_x_m = geometry.rasters[geometry.middle].x_m
         pictures = parallel_map(
-            lambda view: self._target_codes(view, job.channels), job.targets.reduced(self._reduction)
+            lambda view: self._target_codes(view, job.channels), job.targets.reduced(self._reduction)[:2]
         )
 
         def residual(side: int) -> I16:

@@ -20,8 +20,10 @@ from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack, stack_from_eye
 from runtime.records import F32, F64, U8, Eyes
 
-# Points of each pupil that get separate pictures when content is solved for focus, as (right, up) in metres
-SOLVED_POINTS_M = ((-0.00085, -0.00085), (0.00085, 0.00085))
+# Points of each pupil that get separate pictures when content is solved for focus, as (right, up) in metres. The centre
+# comes first, because the network proposes panels for it; steps alternate between the level and the upright ones. With
+# two points, the picture on the retina is worse than without any.
+SOLVED_POINTS_M = ((0.0, 0.0), (0.0012, 0.0), (-0.0012, 0.0), (0.0, 0.0012), (0.0, -0.0012))
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +80,4 @@ def retina_db(pictures: Iterable[tuple[F32, F32]]) -> float:
 
 
 def points_of_pupils(eyes_m: Eyes) -> F64:
-    """Return the (2V, 3) points of pupils that get separate pictures for focus: all eyes for each point."""
-    right, up = stack_from_eye(eyes_m.mean(axis=0))[:3, 0], np.array([0.0, 0.0, 1.0])
-    return np.concatenate([eyes_m + across_m * right + up_m * up for across_m, up_m in SOLVED_POINTS_M])
+    """Return the (P·V, 3) points of pupils that get separate pictures for focus: all eyes for each point."""

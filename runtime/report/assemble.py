@@ -183,9 +183,17 @@ def _moving(page: GrowingPage, *, quick: bool) -> None:
 def _focal(page: GrowingPage) -> None:
     full = StackGeometry().stack()
     with focal.cards_painter(full) as painter:
-        stack = focal.focal_stack(
-            painter, full, model="best", progress=lambda done, of: page.doing(f"focal stack {done}/{of}")
-        )
-    cards = [asdict(card) for card in stack.cards]
-    page.record["focal"] = {"model": stack.model, "cards": cards, "retina_db": stack.retina_db}
-    page.put("focal", focal_section(stack))
+        pinhole, focused = (
+            focal.focal_stack(
+                painter, full, model="best", focus=focus,
+                progress=lambda done, of, part=part: page.doing(f"focal stack {part} of 2, {done}/{of}"),
+            )
+            for part, focus in ((1, False), (2, True))
+        )  # fmt: skip
+    page.record["focal"] = {"model": pinhole.model, **_found(pinhole), "focus": _found(focused)}
+    page.put("focal", focal_section(pinhole, focused))
+
+
+def _found(stack: focal.FocalStack) -> dict[str, Any]:
+    """Return a focal stack's entries in report.json."""
+    return {"cards": [asdict(card) for card in stack.cards], "retina_db": stack.retina_db}

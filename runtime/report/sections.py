@@ -159,40 +159,45 @@ def moving_plot(found: Sequence[Moving]) -> Figure:
     return Figure("moving-viewer", png(figure), told)
 
 
-def focal_section(stack: FocalStack) -> PageSection:
-    """Return a section with a table of convergence and focal distances, and with focused pictures."""
-    headings = ["card", "lines of sight meet at, mm", "sharpest through the layers, mm", "sharpest in truth, mm"]
+def focal_section(pinhole: FocalStack, focused: FocalStack) -> PageSection:
+    """Return a section with a table of convergence and focal distances, and with focused pictures, for layers that were
+    solved without (`pinhole`) and with (`focused`) separate pictures for points of the pupils.
+    """
+    headings = ["card", "lines of sight meet at, mm", "sharpest in truth, mm"]
+    for name in ("without focus", "with focus"):
+        headings += [f"sharpest {name}, mm", f"conflict {name}, dioptres"]
     rows = []
-    for name, card in zip(NAMES, stack.cards, strict=True):
-        places_m = (card.card_m, card.sharpest_shown_m, card.sharpest_true_m)
-        conflict = abs(1 / card.card_m - 1 / card.sharpest_shown_m)
-        rows.append([name, *(f"{1000 * place:.0f}" for place in places_m), f"{conflict:.3f}"])
+    for name, card, own in zip(NAMES, pinhole.cards, focused.cards, strict=True):
+        row = [name, f"{1000 * card.card_m:.0f}", f"{1000 * card.sharpest_true_m:.0f}"]
+        for sharpest_m in (card.sharpest_shown_m, own.sharpest_shown_m):
+            row += [f"{1000 * sharpest_m:.0f}", f"{abs(1 / card.card_m - 1 / sharpest_m):.3f}"]
+        rows.append(row)
     text = [
         "Three cards are placed 5 cm behind, in and 4.5 cm in front of the middle panel. They are seen from "
-        f"{DISTANCE_M:g} m by a pupil of {1000 * PUPIL_M:g} mm. The layers (model {stack.model}) were solved for two "
-        "pinhole eyes only, without a target for the rest of the pupil. On a flat panel, every card is sharpest in "
-        "the panel's plane. The pictures on both retinas, focused at each card, are "
-        f"{stack.retina_db:.1f} dB from those of the cards themselves (retina_db)."
+        f"{DISTANCE_M:g} m by a pupil of {1000 * PUPIL_M:g} mm (model {pinhole.model}). On a flat panel, every card is "
+        "sharpest in the panel's plane. The pictures on both retinas, focused at each card, are "
+        f"{pinhole.retina_db:.1f} dB from those of the cards themselves (retina_db) if the layers were solved for "
+        f"pinhole eyes, and {focused.retina_db:.1f} dB if points of each pupil had pictures of their own "
+        "(content.focus)."
     ]
     caption = (
         "Vergence against accommodation for the right eye. Up to 0.3 dioptres are commonly considered comfortable."
     )
-    table = Table([*headings, "conflict, dioptres"], rows, caption)
-    return PageSection("Focal parallax", text, [slice_picture(stack)], [table])
+    return PageSection("Focal parallax", text, [slice_picture(pinhole, focused)], [Table(headings, rows, caption)])
 
 
-def slice_picture(stack: FocalStack) -> Figure:
-    """Draw pictures focused on each card: views through the layers in the upper row, true views below."""
-    chosen = [min(stack.slices, key=lambda s: abs(s.plane_m - x)) for x in CARDS_M]
-    with drawing(9.6, 3.1) as figure:
-        axes = figure.subplots(2, 3)
-        for column, s in enumerate(chosen):
-            for row, image in enumerate((s.shown, s.true)):
+def slice_picture(pinhole: FocalStack, focused: FocalStack) -> Figure:
+    """Draw pictures focused on each card: through the layers without focus, with it, and in truth."""
+    with drawing(9.6, 4.6) as figure:
+        axes = figure.subplots(3, 3)
+        for column, plane_m in enumerate(CARDS_M):
+            plain, own = (min(one.slices, key=lambda s: abs(s.plane_m - plane_m)) for one in (pinhole, focused))
+            for row, image in enumerate((plain.shown, own.shown, own.true)):
                 axes[row, column].imshow(np.clip(image, 0, 1), interpolation="nearest")
                 axes[row, column].set(xticks=[], yticks=[])
                 axes[row, column].grid(visible=False)
             axes[0, column].set_title(f"focused {NAMES[column]}", fontsize=10)
-        axes[0, 0].set_ylabel("through the layers")
-        axes[1, 0].set_ylabel("true")
+        for row, name in enumerate(("without focus", "with focus", "true")):
+            axes[row, 0].set_ylabel(name)
     text = "From left to right, the eye is focused on the card behind, in and in front of the middle panel."
     return Figure("focal-slices", png(figure), text)

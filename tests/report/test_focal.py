@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from runtime.optics.carried import intensities
+from runtime.optics.focus import FocusCamera, retina_db
 from runtime.optics.stack import PanelStack
+from runtime.records import F32, F64
 from runtime.report import focal
+from runtime.report.pairs import eyes_at
 
 
 @given(st.floats(0.3, 0.6), st.floats(1.0, 50.0))
@@ -39,3 +45,34 @@ def test_through_the_layers_nearer_cards_are_sharpest_nearer(stack: focal.FocalS
 def test_the_retina_s_error_is_told(stack: focal.FocalStack) -> None:
     """A picture that is sharp everywhere is not what a pupil sees of cards at three depths."""
     assert 20 < stack.retina_db < 40
+
+
+@pytest.mark.slow
+def test_pictures_for_points_of_the_pupils_put_the_cards_where_they_stand() -> None:
+    """Solved for pinhole eyes, the rear and the front card are sharpest near the middle panel."""
+    stack = PanelStack(0.162, 0.0648, (-0.06, 0.0, 0.06), 600, 240)  # pixels of the default display, without its edges
+    eye_m = eyes_at(distance_m=focal.DISTANCE_M)[1]
+    camera = FocusCamera(360, 150, 18.0)
+    with focal.cards_painter(PanelStack(0.5184, 0.2916, stack.x_m, 1920, 1080)) as painter:
+
+        def drawn(matrix: F64) -> F32:
+            return intensities(painter.draw(eye_m, matrix, width_px=camera.width_px, height_px=camera.height_px))
+
+        true = [camera.focused(eye_m, drawn, plane_m=plane_m) for plane_m in focal.FOCUSED_M]
+        found = {}
+        for focus in (False, True):
+            layers = focal.cards_layers(painter, stack, eyes_at(distance_m=0.4), model="best", focus=focus)[..., :3]
+            shown = [
+                camera.focused(eye_m, lambda m, layers=layers: camera.through(m, layers, stack), plane_m=plane_m)  # type: ignore[misc]
+                for plane_m in focal.FOCUSED_M
+            ]
+            found[focus] = retina_db(zip(shown, true, strict=True)), blur(shown)
+    assert found[True][0] > found[False][0] + 0.7
+    assert found[True][1] > 1.5 * found[False][1]
+
+
+def blur(pictures: Sequence[F32]) -> float:
+    """How much less contrast the front card has if the eye focuses on the rear one, as a share."""
+    front = slice(30, 120), slice(270, 330)
+    rear, _, own = (focal.contrast(picture, front) for picture in pictures)
+    return 1 - rear / own
