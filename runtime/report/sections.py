@@ -177,7 +177,7 @@ def focal_section(pinhole: FocalStack, focused: FocalStack) -> PageSection:
         f"{DISTANCE_M:g} m by a pupil of {1000 * PUPIL_M:g} mm (model {pinhole.model}). On a flat panel, every card is "
         "sharpest in the panel's plane. The pictures on both retinas, focused at each card, are "
         f"{pinhole.retina_db:.1f} dB from those of the cards themselves (retina_db) if the layers were solved for "
-        f"pinhole eyes, and {focused.retina_db:.1f} dB if points of each pupil had pictures of their own "
+        f"pinhole eyes, and {focused.retina_db:.1f} dB if points of each pupil had separate pictures "
         "(content.focus)."
     ]
     caption = (
