@@ -10,7 +10,7 @@ from runtime.evaluation.contact_sheet import Moment
 from runtime.frame.kept_light import KeptLight, Output
 from runtime.frame.presenter import Refresh
 from runtime.frame.refresh_lines import RefreshLines
-from runtime.frame.sampling import QualitySampler, applies_to, has_picture
+from runtime.frame.sampling import QualitySampler, has_picture
 from runtime.frame.targets import TargetDrawer
 from runtime.frame.truth import TrueEyes
 from runtime.optics.stack import PanelStack
@@ -118,10 +118,10 @@ class RunObserver:
 
         Returns:
             `light_db`; `light_age_s`, the time since the measured refresh; `measured_frame`, that refresh's number. All
-            are None if the eyes, the content or the model have changed since.
+            are None if the eyes, the content or the model have changed since, or a better solution has been found.
         """
-        moment = self._sampler.moment
-        if refresh is None or moment is None or moment.account is None or not applies_to(moment, refresh):
+        moment = None if refresh is None else self._sampler.figure_of(refresh)
+        if refresh is None or moment is None or moment.account is None:
             return dict.fromkeys(("light_db", "light_age_s", "measured_frame"))
         age_s = round(max(0, refresh.account.photon_ns - moment.account.photon_ns) / NS_PER_S, 1)
         light_db = round(moment.light_db, 2)

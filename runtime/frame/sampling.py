@@ -38,6 +38,7 @@ LOOK_S = 0.02  # interval for checking whether the queue is done
 DRAWN_WITHIN_S = 10.0  # timeout for drawing the last refresh's target pictures
 MOVED_M = 0.002  # a figure applies until an eye has moved this far, about twice a tracker's error
 REST_S = 0.3  # how long the eyes must rest before a live page's refresh is measured again
+SETTLED_S = 1.0  # once a solution has been shown for this long, figures of earlier ones no longer apply
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +69,7 @@ class QualitySampler:
         self._rests_at: F64 | None = None  # (2, 3) the eyes since `_rests_since_s`, to within `MOVED_M`
         self._rests_since_s = 0.0
         self._tried: Refresh | None = None  # latest refresh to be measured
+        self._shown, self._shown_since_s = -1, 0.0  # number of the solution shown, and since when
         self.only_live = False  # if True, only live quality is measured
         self.measured: dict[str, list[float]] = {}  # values for each sampled refresh, keyed by name in FIGURES
         self.live: dict[int, float] = {}  # mean squared error of the light at the true eyes, by refresh number
@@ -103,13 +105,27 @@ class QualitySampler:
             return
         if self._rests_at is None or np.abs(account.eyes_m - self._rests_at).max() > MOVED_M:
             self._rests_at, self._rests_since_s = account.eyes_m, now_s
+        if self._shown != solution.number:
+            self._shown, self._shown_since_s = solution.number, now_s
         measured = None if self.moment is None or not applies_to(self.moment, refresh) else self.moment.account
         if measured is not None and measured.solution == solution.number:
             return
-        if self._tried is None or not _is_alike(self._tried, refresh):
+        tried = self._tried
+        if tried is None or not _is_alike(tried, refresh) or self._has_settled(tried.account.solution):
             self._resumes_s = 0.0
         if now_s - self._rests_since_s >= REST_S:
             self._waiting.append(_Sample(refresh, self._drawer.scene))
+
+    def _has_settled(self, before: int | None) -> bool:
+        """Return True if a solution other than `before` has been shown for some time, such as a refined one at rest."""
+        return before != self._shown and time.monotonic() - self._shown_since_s >= SETTLED_S
+
+    def figure_of(self, refresh: Refresh) -> Moment | None:
+        """Return the latest measurement if it holds for a refresh of a live page, or None."""
+        moment = self.moment
+        if moment is None or moment.account is None or not applies_to(moment, refresh):
+            return None
+        return None if self._has_settled(moment.account.solution) else moment
 
     def _holds_too_much(self) -> bool:
         layers = [sample.refresh.solution.layers for sample in self._waiting if sample.refresh.solution is not None]

@@ -492,6 +492,25 @@ def test_a_live_figure_has_an_age_and_follows_a_better_solution(content: Content
     assert eventually(lambda: frame_measured(better) != first)
 
 
+@pytest.mark.parametrize(("settled_s", "has_figure"), [(0.0, False), (600.0, True)])
+def test_a_refined_solution_that_stays_on_the_panels_has_no_old_figure(
+    content: ContentSource, solved: Solution, monkeypatch: pytest.MonkeyPatch, settled_s: float, has_figure: bool
+) -> None:
+    monkeypatch.setattr(sampling, "SETTLED_S", settled_s)
+    observer, _ = looking(content, simulated=False, newest=True)
+    numbers = count(1)
+
+    def is_measured(solution: Solution) -> bool:
+        shown = refresh(next(numbers), solution)
+        observer.refreshed(shown)
+        return observer.light(shown)["light_db"] is not None
+
+    assert eventually(lambda: is_measured(solved))
+    refined = replace(solved, number=2)
+    assert is_measured(refined) == has_figure
+    assert eventually(lambda: is_measured(refined))
+
+
 # --- kept light --------------------------------------------------------------------------------------------------
 
 
