@@ -13,7 +13,7 @@ import numpy as np
 from runtime.content.base import WHITE, ContentInfo, ContentSource, View
 from runtime.optics.rect import PixelRect
 from runtime.records import F32, U8
-from runtime.support.gl import DrawnPicture, finish
+from runtime.support.gl import DrawnPicture, finish, set_uniforms
 
 SIDES = 2
 WHOLE = """#version 330
@@ -90,8 +90,7 @@ class _Reducer:
         target.use()
         depth.compare_func = ""
         depth.use(0)
-        self._program["every"], self._program["first"] = every, first
-        self._program["at_near"], self._program["at_far"] = at_near, at_far
+        set_uniforms(self._program, {"every": every, "first": first, "at_near": at_near, "at_far": at_far})
         self._array.render(self._context.TRIANGLES, vertices=3)
         finish()
         found = np.frombuffer(target.read(components=1, dtype="f4"), np.float32)

@@ -13,6 +13,7 @@ import moderngl
 
 from runtime.errors import ContextLost, PhasestackError
 from runtime.kernels import EDGE_CLAMP_PX, FULL
+from runtime.support.gl import set_uniforms
 
 INCLUDE = re.compile(r'^#include "([a-z_]+\.glsl)"$', re.MULTILINE)
 REPEATED = re.compile(r"^#for ([A-Z]+)\n(.*?)^#end\n", re.MULTILINE | re.DOTALL)
@@ -90,12 +91,13 @@ class Passes:
         default all. Images and other uniforms are keyed by their names in the shader; unused ones are ignored.
         """
         program, array, held = self._program(name, counts)
-        for unit, (key, image) in enumerate(inputs.items()):
+        for unit, image in enumerate(inputs.values()):
             image.texture.use(unit)
-            self._set(program, held, key, unit)
         origin = (0.0, 0.0) if at is None else (float(at[0]), float(at[1]))
-        for key, value in {**uniforms, "origin": origin}.items():
-            self._set(program, held, key, value)
+        values = {**{key: unit for unit, key in enumerate(inputs)}, **uniforms, "origin": origin}
+        changed = {key: value for key, value in values.items() if held.get(key) != value}
+        set_uniforms(program, changed)
+        held |= changed
         target = self.target(outputs)
         target.viewport = at or (0, 0, *outputs[0].size)
         target.use()
@@ -132,11 +134,3 @@ class Passes:
             program = self.context.program(vertex_shader=self._vertex, fragment_shader=fragment)
             self._programs[name, counts] = program, self.context.vertex_array(program, []), {}
         return self._programs[name, counts]
-
-    @staticmethod
-    def _set(program: Any, held: dict[str, Any], key: str, value: Any) -> None:
-        if held.get(key) == value and type(held.get(key)) is type(value):
-            return
-        if key in program:
-            program[key] = value
-        held[key] = value
