@@ -86,7 +86,7 @@ HEAD = """\
     phasestack bench compare old.json new.json
 
 **Quote [light](contracts.md#error) at a tracking error of 1 mm** (`light_db`, `"1"`). *One ray* is `psnr_db`. The
-solution time runs from two decoded pictures to 8-bit layers. Memory is the method's peak. Compare ratios.
+solution time runs from two decoded pictures to 8-bit layers.
 
 `report --pairs` reads every [case file](contracts.md#cases-pairs-calibration) in DIR. The optional field `off`
 lists pictures that should be seen from a point `mm` millimetres away from an eye:
