@@ -81,3 +81,5 @@ def retina_db(pictures: Iterable[tuple[F32, F32]]) -> float:
 
 def points_of_pupils(eyes_m: Eyes) -> F64:
     """Return the (P·V, 3) points of pupils that get separate pictures for focus: all eyes for each point."""
+    right, up = stack_from_eye(eyes_m.mean(axis=0))[:3, 0], np.array([0.0, 0.0, 1.0])
+    return np.concatenate([eyes_m + across_m * right + up_m * up for across_m, up_m in SOLVED_POINTS_M])
