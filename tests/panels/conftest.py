@@ -17,17 +17,22 @@ from tests.panels import xserver
 
 
 @pytest.fixture(scope="session")
-def gl() -> Iterator[moderngl.Context]:
+def shared_context() -> Iterator[moderngl.Context]:
     made = offscreen_context()
     yield made
     made.release()
 
 
 @pytest.fixture
-def context(gl: moderngl.Context) -> Iterator[moderngl.Context]:
+def gl(shared_context: moderngl.Context) -> Iterator[moderngl.Context]:
     """The shared context, made current again."""
-    with gl:
-        yield gl
+    with shared_context:
+        yield shared_context
+
+
+@pytest.fixture
+def context(gl: moderngl.Context) -> moderngl.Context:
+    return gl
 
 
 @pytest.fixture(scope="module")
