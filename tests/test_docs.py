@@ -35,6 +35,7 @@ MEANT = NUMBERS | {
     "Y": "0",
     "Z": "0",
     "F": "1",
+    "M": "0.001",
     "R": "30",
     "NAME": "walk",
 }  # of what contracts.md has in capitals

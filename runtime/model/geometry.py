@@ -103,8 +103,8 @@ class Geometry:
         return tuple(box.cut(self.stack.panel(n)) for n, box in enumerate(self.boxes))
 
     def ray_sets(self, places: Places, eye_sigma_m: float) -> RaySets:
-        """Return one step's ray sets: every view at 1 or 2 head positions, which take turns. The tracking error's
-        `eye_sigma_m` is limited so that all assumed eyes are in front of the panels.
+        """Return one step's ray sets: every view at 1 or 2 head positions, which take turns. The tracking
+        error's `eye_sigma_m` is limited so that all assumed eyes are in front of the panels.
 
         Points of a pupil are seen from the tracked head position alone. They are as far apart as a good tracker's
         errors, so a point that errs would ask for its neighbour's rays to show the point's own picture. A step takes

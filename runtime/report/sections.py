@@ -160,8 +160,8 @@ def moving_plot(found: Sequence[Moving]) -> Figure:
 
 
 def focal_section(pinhole: FocalStack, focused: FocalStack) -> PageSection:
-    """Return a section with a table of convergence and focal distances, and with focused pictures, for layers that were
-    solved without (`pinhole`) and with (`focused`) separate pictures for points of the pupils.
+    """Return a section with a table of convergence and focal distances, and with focused pictures, for
+    layers that were solved without (`pinhole`) and with (`focused`) separate pictures for points of the pupils.
     """
     headings = ["card", "lines of sight meet at, mm", "sharpest in truth, mm"]
     for name in ("without focus", "with focus"):
