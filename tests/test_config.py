@@ -68,7 +68,7 @@ PANEL = '[[output.panels]]\nconnector = "DP-{}"\n'
         ("[plan]\nenabled = 'maybe'", "plan.enabled", "Input should be true or false"),
         ("[stack]\nwidth_px = 'wide'", "stack.width_px", "Input should be a whole number"),
         ("[stack]\nx_m = [0]", "stack.x_m", "must have at least 2 items"),
-        ("[stack]\nx_m = [0, 1, 2, 3, 4, 5, 6, 7, 8]", "stack.x_m", "must have at most 8 items"),
+        ("[stack]\nx_m = [0, 1, 2, 3, 4, 5, 6, 7, 8]", "stack.x_m", "must have at most 6 items"),
         (
             '[content]\nlayout = "foo"',
             "content.layout",
@@ -133,6 +133,11 @@ def test_what_config_prints_is_a_configuration_and_says_where_paths_start(
     printed = capsys.readouterr().out
     assert printed.startswith("# Paths are relative to this file's folder.\n")
     assert loaded(tmp_path, printed) == Settings()
+
+
+def test_a_path_may_begin_at_the_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", "/home/anna")
+    assert loaded(tmp_path, '[content]\nscene = "~/films/a.mkv"\n').content.scene == "/home/anna/films/a.mkv"
 
 
 def test_paths_are_relative_to_the_file_and_names_stay_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

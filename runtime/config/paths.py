@@ -15,8 +15,13 @@ from runtime.support.plugins import located
 
 def path_in(folder: Path | None, value: str, *, or_name: bool = False) -> str:
     """Return a path resolved against the configuration file's folder, if any; with `or_name`, a word
-    without suffix stays.
+    without suffix stays. `~` is the user's home folder, as in a shell.
     """
+    if folder is not None and value.startswith("~/"):
+        try:
+            return str(Path(value).expanduser())
+        except RuntimeError:
+            raise ValueError("the home folder is not known") from None
     if folder is None or Path(value).name in ("", ".."):
         return value
     return located(value, folder) if or_name else str(folder / value)

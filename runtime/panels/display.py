@@ -5,13 +5,14 @@ For use only on the main thread.
 
 from __future__ import annotations
 
+import importlib
 import logging
+import os
 import re
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
-import glfw as _glfw
 import moderngl
 
 from runtime.errors import MissingPart, PanelLost
@@ -21,7 +22,9 @@ from runtime.support.gl import MINIMUM_VERSION
 
 log = logging.getLogger("phasestack.panels")
 
-glfw: Any = _glfw  # untyped, because GLFW's stubs are wrong about bytes, None and pointers
+# In a Wayland session, the Python binding loads a GLFW without X11, even if DISPLAY names an X server.
+os.environ.setdefault("PYGLFW_LIBRARY_VARIANT", "x11")
+glfw: Any = importlib.import_module("glfw")  # untyped: GLFW's stubs are wrong about bytes, None and pointers
 
 # By default, the Python binding turns errors into warnings.
 glfw.ERROR_REPORTING = "exception"

@@ -66,7 +66,8 @@ def config(tmp_path: Path) -> Path:
 def started(x: XServer, *arguments: Path | str) -> Popen[Any]:
     """The command in a separate process, with the test's keys."""
     command = [sys.executable, "-m", "runtime.cli", "identify", *map(str, arguments)]
-    environment = os.environ | {"DISPLAY": x.name, "OMP_NUM_THREADS": "1"}
+    # The type of a session says nothing about the X server that DISPLAY names.
+    environment = os.environ | {"DISPLAY": x.name, "OMP_NUM_THREADS": "1", "XDG_SESSION_TYPE": "wayland"}
     return subprocess.Popen(command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
 
