@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from textwrap import wrap
 
@@ -19,8 +20,9 @@ from runtime.panels.card import alone, identity_card
 from runtime.panels.monitors import Monitor
 from runtime.panels.window import every_monitor
 from runtime.records import U8, EyePoints, SensorFrame
+from runtime.sensor.live import SensorProcess, SensorSetup
+from runtime.sensor.polling import OPEN_TIMEOUT_S, SensorState
 from runtime.sensor.registry import open_sensor
-from runtime.sensor.worker import OPEN_TIMEOUT_S, SensorWorker
 
 Poll = Callable[[], Key | None]
 Say = Callable[[str], None]
@@ -44,7 +46,7 @@ class SetupHardware:
         self._display: PanelDisplay | None = None  # the windows that are open
         self._charts: Charts | None = None
         self._cards: tuple[list[U8], tuple[Monitor, ...]] = ([], ())
-        self._worker: SensorWorker | None = None
+        self._worker: SensorProcess | None = None
         self._frames: list[SensorFrame] = []  # received, but not yet returned by `sample`
 
     def poll(self) -> Key | None:
@@ -106,17 +108,12 @@ class SetupHardware:
         the driver is unknown, it does not work in time, or it delivers eyes in the stack frame.
         """
         self._stop_sensor()
-        open_sensor(settings.sensor, self._clock)  # refuses unknown names before anything starts
-        worker = SensorWorker(
-            lambda: open_sensor(settings.sensor, self._clock),
-            settings.sensor,
-            self._clock,
-            lambda: EyeFinder(settings).find_all,
-        )
-        worker.start()
+        make_driver = partial(open_sensor, settings.sensor, self._clock)
+        worker = SensorProcess(SensorSetup(make_driver, settings.sensor, self._clock, partial(EyeFinder, settings)))
         self._worker = worker
+        worker.start()
         until_ns = self._clock.now_ns() + round(OPEN_TIMEOUT_S * NS_PER_S)
-        while worker.capabilities is None:
+        while worker.state is not SensorState.RUNNING:
             if worker.error is not None:
                 raise worker.error
             if self._clock.now_ns() > until_ns:

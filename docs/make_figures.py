@@ -110,7 +110,7 @@ def architecture() -> Figure:
         )
         axes.text(x + width - 0.2, y + height - 0.15, name, fontsize=9, va="top", ha="right", color=SOFT)
     white = "#ffffff"
-    box(axes, 0.6, 7.8, 4.2, 1.6, "sensor: driver or recording\nsensor/worker.py", white)
+    box(axes, 0.6, 7.8, 4.2, 1.6, "sensor: driver or recording\nsensor/polling.py", white)
     box(axes, 5.7, 7.8, 4.2, 1.6, "eyes: pupils in pictures\neyes/detect.py", white)
     box(axes, 0.6, 4.4, 4.2, 1.6, "calibration: sensor to stack\neyes/calibration.py", white)
     box(axes, 5.7, 4.4, 4.2, 1.6, "tracker: predicts the eyes\neyes/tracker.py", white)

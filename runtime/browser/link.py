@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -44,7 +44,7 @@ class BrowserLink:
     camera_fov_deg: float = 65.0  # the page camera's horizontal field of view; 65 degrees is typical of webcams
     wishes: dict[str, float] = field(default_factory=dict)  # changes requested that need a restart: gap_mm, camera
     moment: Any = None  # layers and target pictures from the latest measured refresh
-    found: dict[str, Any] | None = None  # latest camera picture and the pupils found in it
+    found: Mapping[str, Any] | None = None  # latest camera picture and the pupils found in it
     frame: PanelFrame | None = None  # latest frame presented on the panels
     shown: tuple[PanelFrame | None, dict[str, Any]] = (None, {})  # frame and status of the latest refresh
     news: dict[object, Callable[[], None]] = field(default_factory=dict)  # called when data changes, by page
@@ -91,24 +91,10 @@ class BrowserLink:
             taken, self._picture = self._picture, None
         return taken
 
-    def reporting(self, finder: Any) -> Callable[[SensorFrame], tuple[EyePoints, ...]]:
-        """Wrap an eye finder in a function that also sends the results to all pages."""
-
-        def find(frame: SensorFrame) -> tuple[EyePoints, ...]:
-            eyes: tuple[EyePoints, ...] = finder.find_all(frame)
-            if frame.colour is not None and self.news:
-                height, width = frame.colour.shape[:2]
-                size = (OVERLAY_PX, round(OVERLAY_PX * height / width))
-                small: Any = cv2.resize(frame.colour[..., ::-1], size, interpolation=cv2.INTER_AREA)
-                coded = base64.b64encode(cv2.imencode(".jpg", small)[1].tobytes()).decode()
-                pupils = finder.pupils
-                pupils_px = None if pupils is None else np.asarray(pupils.eyes_px) * (OVERLAY_PX / width)
-                self.found = {"url": f"data:image/jpeg;base64,{coded}", "size": size, "pupils_px": pupils_px,
-                              "reason": finder.reason}  # fmt: skip
-                self._notify()
-            return eyes
-
-        return find
+    def report(self, found: Mapping[str, Any]) -> None:
+        """Show all pages a camera picture and the pupils found in it (`Reporting.found`)."""
+        self.found = found
+        self._notify()
 
     def captured(self, capture_ns: int, page_ms: float) -> None:
         """Store a capture's time on the page's clock."""
@@ -126,3 +112,24 @@ class BrowserLink:
     def _notify(self) -> None:
         for notify in tuple(self.news.values()):
             notify()
+
+
+class Reporting:
+    """An eye finder that also keeps the last picture, with the pupils, for pages to show."""
+
+    def __init__(self, make_finder: Callable[[], Any]) -> None:
+        self._finder = make_finder()
+        self.found: dict[str, Any] | None = None
+
+    def find_all(self, frame: SensorFrame) -> tuple[EyePoints, ...]:
+        eyes: tuple[EyePoints, ...] = self._finder.find_all(frame)
+        if frame.colour is not None:
+            height, width = frame.colour.shape[:2]
+            size = (OVERLAY_PX, round(OVERLAY_PX * height / width))
+            small: Any = cv2.resize(frame.colour[..., ::-1], size, interpolation=cv2.INTER_AREA)
+            coded = base64.b64encode(cv2.imencode(".jpg", small)[1].tobytes()).decode()
+            pupils = self._finder.pupils
+            pupils_px = None if pupils is None else np.asarray(pupils.eyes_px) * (OVERLAY_PX / width)
+            self.found = {"url": f"data:image/jpeg;base64,{coded}", "size": size, "pupils_px": pupils_px,
+                          "reason": self._finder.reason}  # fmt: skip
+        return eyes

@@ -347,6 +347,22 @@ def service(settings: Settings) -> Iterator[Row]:
         yield Row("service", "fail", f"{state} ({answer.get('reason', '')})", "see the log: journalctl -u phasestack")
     else:
         yield Row("service", "ok", f"{state} ({answer.get('reason', '')}), pid {answer.get('pid')}")
+    for process in answer.get("processes", ()):
+        restarts, detail = process.get("restarts", 0), _process_in_words(process)
+        if restarts:
+            yield Row(
+                "processes", "warn", f"{detail}, restarted {restarts} times", "see the log: journalctl -u phasestack"
+            )
+        else:
+            yield Row("processes", "ok", detail)
+
+
+def _process_in_words(process: dict[str, Any]) -> str:
+    if process.get("pid") is None:
+        return f"{process['role']}: is being restarted"
+    return (
+        f"{process['role']}: pid {process['pid']}, {process['memory_mib']} MiB, {process['cpu_s']} s of processor time"
+    )
 
 
 def _daemon(settings: Settings) -> dict[str, Any] | None:

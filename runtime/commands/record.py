@@ -18,7 +18,7 @@ from runtime.support.ranges import RECORD_MOST_S
 if TYPE_CHECKING:
     from runtime.config import Settings
     from runtime.records import SensorFrame
-    from runtime.sensor.worker import SensorWorker
+    from runtime.sensor.live import LiveSamples
 
 POLL_S = 0.004  # polling interval, a quarter of the period at 60 Hz
 FIRST_SAMPLE_S = 15.0  # how long to wait for the first sample
@@ -107,7 +107,7 @@ def _refuse_target(out: Path, *, motion: bool) -> None:
         folder = next(folder for folder in out.absolute().parents if os.path.lexists(folder))
         if not os.path.isdir(folder):  # noqa: PTH112
             raise InputError(out, "--out", f"cannot be written: {folder} is not a folder")
-        if not os.access(folder, os.W_OK | os.X_OK):
+        if not os.access(folder, os.W_OK | os.X_OK, effective_ids=True):
             raise InputError(out, "--out", "cannot be written: Permission denied")
         return
     try:
@@ -122,22 +122,20 @@ def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | N
     """Record until Ctrl-C, a limit (by default ten minutes), or the end of the source. Returns a summary.
     Raises FatalError if the sensor cannot be used or delivers nothing, and InputError for the file.
     """
+    from functools import partial
+
     from runtime.clock import NS_PER_S, MonotonicClock
     from runtime.eyes.detect import EyeFinder
+    from runtime.sensor.live import SensorProcess, SensorSetup
     from runtime.sensor.recording import MAX_S, recording_to
     from runtime.sensor.recording_format import RecordingHeader
     from runtime.sensor.registry import open_sensor
-    from runtime.sensor.worker import SensorWorker
     from runtime.support import progress
 
     clock, s = MonotonicClock(), settings.sensor
-    worker = SensorWorker(
-        lambda: open_sensor(s, clock),
-        s,
-        clock,
-        lambda: EyeFinder(settings, most_people=settings.sought_people).find_all,
-        keep_images=images,
-    )
+    make_finder = partial(EyeFinder, settings, most_people=settings.sought_people)
+    setup = SensorSetup(partial(open_sensor, s, clock), s, clock, make_finder, keep_images=images)
+    worker = SensorProcess(setup)
     max_s, stopped = seconds or MAX_S, "reached the time limit"
     writer, first_ns, so_far_s = None, 0, 0.0
     holds: dict[str, None] = {}
@@ -184,7 +182,7 @@ def _streams(frame: SensorFrame) -> list[str]:
     return [name for name, value in parts.items() if value is not None]
 
 
-def _samples(worker: SensorWorker, limit_s: float) -> Iterator[SensorFrame]:
+def _samples(worker: LiveSamples, limit_s: float) -> Iterator[SensorFrame]:
     """Yield samples until the source ends or until `limit_s` seconds after the first sample."""
     import time
 

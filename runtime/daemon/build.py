@@ -7,12 +7,13 @@ import os
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cv2
 
-from runtime.browser.link import BrowserLink
+from runtime.browser.link import BrowserLink, Reporting
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock, MonotonicClock, SimulatedClock
 from runtime.config import Settings
 from runtime.daemon import solver_worker
@@ -36,11 +37,10 @@ from runtime.panels.base import PanelSink
 from runtime.panels.registry import BrowserPanels, open_panels
 from runtime.plan.savings import Saving, make_plan
 from runtime.records import Effort, RefreshAccount
-from runtime.sensor.base import Sensor
 from runtime.sensor.browser import BrowserCamera, BrowserEyes
+from runtime.sensor.live import LiveSamples, SensorProcess, SensorSetup, SensorThread
 from runtime.sensor.registry import open_sensor
-from runtime.sensor.samples import FindEyes, RecordedSamples, Samples
-from runtime.sensor.worker import SensorWorker
+from runtime.sensor.samples import RecordedSamples, Samples
 from runtime.support.background import before_all_others
 from runtime.support.gl import offscreen_context
 from runtime.support.untrusted_input import MIB
@@ -169,24 +169,18 @@ def build_run(
     for warning in calibration.warnings:
         log.warning("%s", warning)
 
-    def make_driver() -> Sensor:
-        if options.browser is not None and (options.browser.is_sensor or options.browser.is_camera):
-            return (BrowserEyes if options.browser.is_sensor else BrowserCamera)(options.browser, clock)
-        # On a simulated clock, a run would never end if its recording began again.
-        sensor = settings.sensor.model_copy(update={"loop": False}) if simulated else settings.sensor
-        return open_sensor(sensor, clock, latency_ms=settings.loop.sensor_latency_ms)
-
-    def make_find() -> FindEyes:
-        finder = EyeFinder(settings, most_people=settings.sought_people)
-        return finder.find_all if options.browser is None else options.browser.reporting(finder)
-
-    driver = make_driver()
     samples: Samples
     if simulated:
+        # On a simulated clock, a run would never end if its recording began again.
+        recording = settings.sensor.model_copy(update={"loop": False})
+        driver = open_sensor(recording, clock, latency_ms=settings.loop.sensor_latency_ms)
         samples = RecordedSamples(driver)
-        cleanup.callback(samples.close)
+        in_stack_frame = driver.capabilities.in_stack_frame
+    else:  # first, because the processes start while the panels are being opened
+        samples = sensor = start_sensor(settings, clock, options.browser)
+    cleanup.callback(samples.close)
     solver: SolverHost
-    if not simulated:  # first, because it starts while the panels are being opened
+    if not simulated:
         lost: list[PanelSink] = []
         solver = process = start_solver(
             settings, stack, clock, contexts_lost=lambda: sum(sink.contexts_lost for sink in lost)
@@ -209,10 +203,8 @@ def build_run(
         process.wait_ready(lambda: host.starting("loading the scene and the model"))
         if not process.is_known:
             raise Stopped("stopped during startup")
-        samples = worker = SensorWorker(make_driver, settings.sensor, clock, make_find)
-        cleanup.callback(worker.close)
-        worker.start()
-    in_stack_frame = driver.capabilities.in_stack_frame
+        sensor.start(lambda: host.starting("starting the sensor"))
+        in_stack_frame = sensor.capabilities.in_stack_frame
     observer = RunObserver(
         stack,
         TargetDrawer(solver),
@@ -253,6 +245,30 @@ def build_run(
     run = Run(presenter, observer, simulated)
     host.watches(run)
     return run
+
+
+def start_sensor(settings: Settings, clock: Clock, link: BrowserLink | None = None) -> LiveSamples:
+    """Return a live sensor that is not polled yet.
+
+    Args:
+        link: Link to a page, which may be the sensor.
+
+    Raises:
+        TransientError: No thread can be started.
+    """
+    make_driver = partial(open_sensor, settings.sensor, clock, latency_ms=settings.loop.sensor_latency_ms)
+    make_finder = partial(EyeFinder, settings, most_people=settings.sought_people)
+    if link is None:
+        return SensorProcess(SensorSetup(make_driver, settings.sensor, clock, make_finder))
+    shown = partial(Reporting, make_finder)
+    sensor: LiveSamples
+    if link.is_sensor or link.is_camera:
+        driver = BrowserEyes if link.is_sensor else BrowserCamera
+        sensor = SensorThread(SensorSetup(partial(driver, link, clock), settings.sensor, clock, shown))
+    else:
+        sensor = SensorProcess(SensorSetup(make_driver, settings.sensor, clock, shown))
+    sensor.on_found = link.report
+    return sensor
 
 
 def start_solver(

@@ -93,7 +93,11 @@ def snapshot(run: Run, account: RefreshAccount) -> dict[str, Any]:
         "backend": facts.backend,
         "backend_why": facts.backend_why,
         "panels": presenter.panels.name,
-        "processes": [{"role": "presenter", "restarts": 0, **usage(os.getpid())}, *presenter.solver.status()],
+        "processes": [
+            {"role": "presenter", "restarts": 0, **usage(os.getpid())},
+            *presenter.solver.status(),
+            *presenter.samples.status(),
+        ],
         "eyes_m": account.eyes_m,
         "eyes_label": account.eyes_label,
         "eye_sigma_now_mm": account.eye_sigma_mm,

@@ -35,7 +35,10 @@ class EyeFinder:
         choice: Description of how the viewer was chosen.
         reason: Why no eyes of the viewer were found in the last frame, or an empty string.
         pupils: The viewer's pupils found in the last frame, even if their distance is unknown. None if there were none.
+        found: None, because this finder has nothing for pages to show.
     """
+
+    found = None
 
     def __init__(self, settings: Settings | None = None, *, most_people: int = 1) -> None:
         """Create a finder. `settings.calibration` may have the viewer's eye separation."""

@@ -1,18 +1,29 @@
-"""Sample sources: the sensor thread in real time, or a recording played against a simulated clock."""
+"""Sample sources: a sensor in real time (`live.py`), or a recording played against a simulated clock."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import Any, Protocol
 
 from runtime.clock import NS_PER_S
 from runtime.errors import EndOfRecording, InputError
 from runtime.records import EyePoints, SensorFrame
 from runtime.sensor.base import Sensor, SteppedSensor
 
-FindEyes = Callable[[SensorFrame], tuple[EyePoints, ...]]  # all people's eyes, nearest first
 AHEAD_NS = NS_PER_S // 10  # longer than the time from a sample's capture to the display of the refresh that uses it
+
+
+class Finder(Protocol):
+    """Finds eyes in a sensor's pictures."""
+
+    @property
+    def found(self) -> Mapping[str, Any] | None:
+        """The last picture and the pupils found in it, for pages to show; None if nothing is to be shown."""
+
+    def find_all(self, frame: SensorFrame) -> tuple[EyePoints, ...]:
+        """Return all people's eyes in frame `sensor`, nearest first."""
 
 
 class Samples(ABC):
@@ -34,6 +45,10 @@ class Samples(ABC):
         """Return the reason why the sensor is not working, or an empty string."""
         return ""
 
+    def status(self) -> list[dict[str, Any]]:
+        """Return what the sensor's process uses, for the status. Empty if it is this process."""
+        return []
+
     def recorded_ahead(self) -> list[SensorFrame]:
         """Return the recorded samples that follow shortly after the last refresh, for evaluation.
 
@@ -46,15 +61,15 @@ class Samples(ABC):
         """Release the sensor. May be called twice."""
 
 
-def searched(frame: SensorFrame, find: FindEyes | None, *, keep_images: bool = False) -> SensorFrame:
+def searched(frame: SensorFrame, finder: Finder | None, *, keep_images: bool = False) -> SensorFrame:
     """Return a sample with the eyes found in its pictures, and without the pictures themselves.
 
     Args:
-        find: Eye finder. None leaves the sample's eyes unchanged.
+        finder: Eye finder. None leaves the sample's eyes unchanged.
         keep_images: Keep the pictures in the sample.
     """
-    if find is not None:
-        first, *others = find(frame) or (None,)
+    if finder is not None:
+        first, *others = finder.find_all(frame) or (None,)
         frame = replace(frame, eyes=first, others=tuple(others))
     return frame if keep_images else replace(frame, colour=None, depth_mm=None)
 

@@ -45,7 +45,7 @@ AGAIN_S, AGAIN_MAX_S = 0.25, 5.0  # delay before a worker that was never well is
 ENDS_S = 0.5  # how long a worker gets to end by itself when the run ends
 SENT_S = 0.25  # how long a worker waits for its parent to read, before it renews its time limit
 TRACE_BYTES = 1 << 16  # most bytes of a crashed worker's stack that are kept
-DEADLINE, READY = 0, 1  # indices into the words shared by a worker and its parent
+DEADLINE, READY, READ = 0, 1, 2  # indices into the words shared by a worker and its parent
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,7 +208,9 @@ class Worker:
                 messages.append(Began(life.number))
             ended = life.ended  # read before the channel, because no message arrives after it
             with contextlib.suppress(ChannelClosed):
-                messages += life.channel.receive()
+                arrived = life.channel.receive()
+                life.words[READ] += len(arrived)
+                messages += arrived
             if ended is None:
                 break
             messages.append(Ended(ended))
@@ -380,7 +382,7 @@ class Parent:
 
     def __init__(self, channel: Channel, words: memoryview) -> None:
         self._channel, self._words = channel, words
-        self._allowed_s = 0.0
+        self._allowed_s, self._sent = 0.0, 0
 
     def allow(self, seconds: float) -> None:
         """Renew the time limit: unless this method is called again before it is over, this process is killed."""
@@ -405,6 +407,21 @@ class Parent:
         """
         while not self._channel.send(message, timeout_s=SENT_S):
             self.allow(self._allowed_s)
+        self._sent += 1
+
+    def offer(self, message: Any) -> bool:
+        """Send a message without waiting. Return False if the parent has too many messages unread.
+
+        Raises ChannelClosed if the parent has closed the channel.
+        """
+        is_sent = self._channel.send(message)
+        self._sent += is_sent
+        return is_sent
+
+    @property
+    def unread(self) -> int:
+        """Number of messages that the parent has not read."""
+        return self._sent - self._words[READ]
 
 
 class _Forwarded(logging.Handler):

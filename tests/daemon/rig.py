@@ -11,14 +11,14 @@ from unittest.mock import patch
 
 import numpy as np
 
-from runtime.config import SensorSettings, Settings
-from runtime.daemon.build import Host, Run, RunOptions, build_run, start_solver
+from runtime.config import Settings
+from runtime.daemon.build import Host, Run, RunOptions, build_run, start_sensor, start_solver
 from runtime.daemon.solver_parts import RunningSolver, SolverSetup
 from runtime.errors import PanelLost
 from runtime.frame.presenter import Presenter
 from runtime.records import EyePoints, PanelFrame, PresentReport, RefreshAccount, SensorFrame, State
 from runtime.sensor.base import Capabilities, Sensor
-from runtime.sensor.registry import open_sensor
+from runtime.sensor.live import LiveSamples, SensorSetup, SensorThread
 from tests.daemon.inline import ThreadSolver
 
 SMALL: dict[str, Any] = {
@@ -28,7 +28,7 @@ SMALL: dict[str, Any] = {
     "model": {"name": "fast", "threads": 1, "backend": "cpu"},  # auto depends on the machine's load
     "loop": {"rate_hz": 200.0},
 }
-QUICK = {"sensor.worker.REOPEN_AFTER_S": 0.02, "sensor.worker.REOPEN_AFTER_MAX_S": 0.05, "frame.policy.BLEND_S": 0.02}
+QUICK = {"sensor.polling.REOPEN_AFTER_S": 0.02, "sensor.polling.REOPEN_AFTER_MAX_S": 0.05, "frame.policy.BLEND_S": 0.02}
 
 
 class Plan:
@@ -36,13 +36,10 @@ class Plan:
 
     def __init__(self) -> None:
         self.opened = 0
-        self.hang = threading.Event()  # set: calls don't return
-        self.released = threading.Event()  # set: hung calls return after all
         self.mend()
 
     def mend(self) -> None:
         """All is well from now on."""
-        self.hang.clear()
         self.fault: Exception | None = None
         self.refuse: Exception | None = None
         self.eyes_m = np.array([[0.7, -0.031, 0.0], [0.7, 0.031, 0.0]])
@@ -67,8 +64,6 @@ class FragileDriver(Sensor):
         self.serial = "F-1"
 
     def read_newest(self, timeout_s: float) -> SensorFrame:
-        if self._plan.hang.is_set():
-            self._plan.released.wait(30.0)
         if self._plan.fault is not None:
             raise self._plan.fault
         time.sleep(0.01)
@@ -92,13 +87,9 @@ class Rig:
         recorder: Any = None,
         late_s: float = 5.0,  # tolerate a busy machine
         in_process: bool = False,  # True to run the solver in a process, as it does outside of tests
-        open_timeout_s: float = 0.3,
         **changes: dict[str, Any],
     ) -> None:
-        self._times = QUICK | {
-            "frame.solver_process.LATE_S": late_s,
-            "sensor.worker.OPEN_TIMEOUT_S": open_timeout_s,
-        }
+        self._times = QUICK | {"frame.solver_process.LATE_S": late_s}
         self.plan = Plan()
         tables = {name: {**SMALL.get(name, {}), **changes.get(name, {})} for name in {**SMALL, **changes}}
         self.settings = Settings.model_validate(tables)
@@ -112,7 +103,7 @@ class Rig:
         try:
             for name, seconds in self._times.items():
                 self._cleanup.enter_context(patch(f"runtime.{name}", seconds))
-            self._cleanup.enter_context(patch("runtime.daemon.build.open_sensor", self._opened))
+            self._cleanup.enter_context(patch("runtime.daemon.build.start_sensor", self._sensor_of))
             self._cleanup.enter_context(patch("runtime.daemon.build.start_solver", self._solver_of))
             self.run: Run = build_run(
                 self.settings, RunOptions(), self._cleanup, self.host, on_account=self.accounts.append
@@ -128,8 +119,10 @@ class Rig:
             return start_solver(settings, stack, clock, **how)
         return ThreadSolver(SolverSetup(settings, stack), clock)
 
-    def _opened(self, settings: SensorSettings, clock: Any, **how: Any) -> Sensor:
-        return FragileDriver(self.plan, clock) if settings.driver == "fragile" else open_sensor(settings, clock, **how)
+    def _sensor_of(self, settings: Settings, clock: Any, link: Any = None) -> LiveSamples:
+        if settings.sensor.driver != "fragile":
+            return start_sensor(settings, clock, link)
+        return SensorThread(SensorSetup(lambda: FragileDriver(self.plan, clock), settings.sensor, clock))
 
     def mend(self) -> None:
         """Restore everything that was broken to its initial state."""
@@ -139,7 +132,6 @@ class Rig:
             self.parts.run.replace(predictor=predictor)
 
     def __exit__(self, *exception: object) -> None:
-        self.plan.released.set()
         self._cleanup.close()
 
     @property

@@ -47,7 +47,7 @@ class Served:
             server=self.server,
             recorder=recorder,
         )
-        self.rig = Rig(host=self.daemon, open_timeout_s=20.0, **(STEADY | changes))
+        self.rig = Rig(host=self.daemon, **(STEADY | changes))
 
     def __enter__(self) -> Served:
         self.rig.__enter__()

@@ -84,11 +84,18 @@ def test_a_real_sensor_with_the_demos_calibration_is_a_failure(tmp_path: Path) -
     assert checks["usb"]["state"] == "fail"
 
 
+SOLVER = {"role": "solver", "pid": 7, "restarts": 0, "memory_mib": 300.5, "cpu_s": 12.0}
+
+
 @pytest.mark.parametrize(
     ("account", "seconds", "state"),
     [
-        ({"state": "tracking", "reason": "eyes seen"}, 0, "ok"),
-        ({"state": "degraded: sensor", "reason": "sensor: unplugged"}, 0, "fail"),
+        ({"state": "tracking", "reason": "eyes seen", "processes": [SOLVER]}, 0, "ok"),
+        (
+            {"state": "degraded: sensor", "reason": "sensor: unplugged", "processes": [SOLVER | {"restarts": 2}]},
+            0,
+            "fail",
+        ),
         ({"state": "tracking"}, 60, "fail"),
     ],
 )
@@ -102,6 +109,11 @@ def test_a_running_daemon_is_asked_how_it_is(tmp_path: Path, account: Any, secon
     finally:
         server.close()
     assert checks["service"]["state"] == state
+    if "processes" in account:
+        restarts = account["processes"][0]["restarts"]
+        assert checks["processes"]["state"] == ("warn" if restarts else "ok")
+        words = "solver", "pid 7", "300.5 MiB", "12.0 s", *(["restarted 2 times"] if restarts else [])
+        assert all(word in checks["processes"]["detail"] for word in words)
     assert checks["sensor"]["state"] == "skip"  # it has the device: opening it here would fail, or disturb
     assert code == 1
 

@@ -18,7 +18,8 @@ from runtime.daemon import supervise
 from runtime.daemon.build import RunOptions
 from runtime.errors import PASSING, InputError, SensorLost, TransientError, is_retryable
 from runtime.sensor.base import Capabilities
-from runtime.sensor.worker import SensorState, SensorWorker
+from runtime.sensor.live import SensorSetup, SensorThread
+from runtime.sensor.polling import SensorState
 from tests.waiting import eventually
 
 ROOT = Path(__file__).parents[2]
@@ -109,11 +110,11 @@ class Refusing:
 def test_a_sensor_that_lacks_descriptors_to_reopen_is_tried_again(number: int, opened: bool) -> None:
     errors: list[Exception] = [read_by_a_reader(number), read_by_a_reader(number)]
     sensor: Any = Refusing
-    worker = SensorWorker(lambda: sensor(errors), SensorSettings(), MonotonicClock())
+    worker = SensorThread(SensorSetup(lambda: sensor(errors), SensorSettings(), MonotonicClock()))
     worker.start()
     try:
         if opened:
-            assert eventually(lambda: worker.reason == "open it was", within_s=20)
+            assert eventually(lambda: worker.state and worker.reason == "open it was", within_s=20)
         else:
             assert eventually(lambda: worker.state is SensorState.FAILED, within_s=20)
             assert isinstance(worker.error, InputError)

@@ -44,7 +44,7 @@ def running(deed: Path) -> Iterator[Rig]:
         patch.setenv("STATE_DIRECTORY", str(deed.parent))
         patch.setattr("runtime.daemon.build.STEP_S", STEP_S)
         patch.setattr("runtime.daemon.build.SOLVER_MEMORY_BYTES", MEMORY_BYTES)
-        with Rig(in_process=True, late_s=0.3, open_timeout_s=20.0, **steady) as made:
+        with Rig(in_process=True, late_s=0.3, **steady) as made:
             made.refresh_until_solved()
             made.refresh_until(TRACKING)
             yield made

@@ -1,10 +1,8 @@
-"""Tests that the sensor's thread prefers the newest sample, reopens lost sensors and abandons hung ones."""
+"""Tests that a sensor is polled, checked and reopened."""
 
 from __future__ import annotations
 
 import itertools
-import statistics
-import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -17,11 +15,11 @@ from runtime.config import SensorSettings
 from runtime.errors import EndOfRecording, FatalError, SensorLost, SensorTimeout
 from runtime.records import EyePoints, SensorFrame
 from runtime.sensor.base import Capabilities, Sensor
-from runtime.sensor.worker import SensorState, SensorWorker
+from runtime.sensor.live import SensorSetup, SensorThread
+from runtime.sensor.polling import SensorState
 from tests.waiting import eventually
 
 SETTINGS = SensorSettings(timeout_s=0.05)
-FRAME_S = 1 / 60
 DELIVERED = ("picture has", "depth picture has", "eye points have")
 
 
@@ -51,13 +49,12 @@ class Scripted(Sensor):
 
 
 @pytest.fixture
-def started(monkeypatch: pytest.MonkeyPatch) -> Any:
-    monkeypatch.setattr("runtime.sensor.worker.OPEN_TIMEOUT_S", 0.2)
+def started() -> Any:
     workers = []
 
     def start(act: Any, *, on_open: Any = None, settings: Any = SETTINGS) -> Any:
         log: list[Any] = []
-        worker = SensorWorker(lambda: Scripted(act, log, on_open=on_open), settings, MonotonicClock())
+        worker = SensorThread(SensorSetup(lambda: Scripted(act, log, on_open=on_open), settings, MonotonicClock()))
         worker.start()
         workers.append(worker)
         return worker, log
@@ -92,11 +89,14 @@ def test_all_samples_since_the_last_time_are_handed_out_in_order(started: Callab
 
 
 def test_what_nobody_reads_does_not_pile_up(started: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("runtime.sensor.worker.QUEUE_MAX", 10)
-    worker, _ = started(lambda: time.sleep(0.001))
-    assert eventually(lambda: worker.stale_inputs >= 20)
+    monkeypatch.setattr("runtime.sensor.polling.QUEUE_MAX", 10)
+    monkeypatch.setattr("runtime.sensor.live.UNREAD_MAX", 10)
+    read = []
+    worker, _ = started(lambda: (read.append(1), time.sleep(0.001)))
+    assert eventually(lambda: len(read) > 60)
     frames = worker.take()
-    assert len(frames) == 10 and frames[0].sequence > 20
+    assert [frame.sequence for frame in frames[:10]] == list(range(1, 11)) and len(frames) <= 21
+    assert eventually(lambda: worker.take() != [] and worker.stale_inputs >= 20)
 
 
 def test_a_driver_that_may_pause_is_neither_stalled_nor_reopened(
@@ -168,67 +168,6 @@ def test_the_end_of_a_recording_is_reported_after_its_last_sample(started: Calla
         worker.arrived(0)
 
 
-@pytest.mark.parametrize("where", ["open", "read"])
-def test_an_sdk_that_hangs_is_abandoned_and_never_blocks_the_loop(
-    started: Callable[..., Any], where: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("runtime.sensor.worker.HANG_MARGIN_S", 0.1)
-    hung: list[Any] = []
-    release = threading.Event()
-
-    def hang_once() -> None:
-        time.sleep(0.002)
-        if not hung:
-            hung.append(threading.current_thread())
-            release.wait(20)
-
-    worker, log = started(hang_once if where == "read" else lambda: time.sleep(0.002),
-                          on_open=hang_once if where == "open" else None)  # fmt: skip
-    taken, seen, end = [], False, time.monotonic() + 5
-    while not seen and time.monotonic() < end:
-        begin = time.perf_counter()
-        seen = bool(worker.take() and hung)
-        state = worker.state
-        taken.append(time.perf_counter() - begin)
-        time.sleep(0.002)
-    assert seen and state == "running" and sum("open" in line for line in log) == 2
-    # The driver hangs for 20 s; no call waited for it, even on a busy machine.
-    assert max(taken) < 0.5 and statistics.median(taken) < FRAME_S / 4
-    assert hung[0].is_alive()
-    # The abandoned thread's results are ignored, and it closes its driver as it ends.
-    closed = log.count("close")
-    release.set()
-    assert eventually(lambda: not hung[0].is_alive())
-    assert log.count("close") == closed + 1 and worker.state == "running"
-
-
-def test_stopping_keeps_its_time_out_even_when_an_sdk_hangs(started: Callable[..., Any]) -> None:
-    release = threading.Event()
-    worker, _ = started(lambda: release.wait(20))
-    time.sleep(0.05)
-    begin = time.monotonic()
-    worker.close(timeout_s=0.1)
-    assert time.monotonic() - begin < 1.0 and worker.state == "stopped"
-    release.set()
-
-
-def test_a_device_that_always_hangs_does_not_fill_memory_with_threads(
-    started: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("runtime.sensor.worker.HANG_MARGIN_S", 0.0)
-    monkeypatch.setattr("runtime.sensor.worker.ABANDONED_MAX", 3)
-    release = threading.Event()
-    monkeypatch.setattr("runtime.sensor.worker.OPEN_TIMEOUT_S", 0.02)
-    quick = SETTINGS.model_copy(update={"timeout_s": 0.01})
-    worker, _ = started(lambda: None, on_open=lambda: release.wait(20), settings=quick)
-    before = threading.active_count()
-    for _ in range(100):
-        worker.take()
-        time.sleep(0.01)
-    assert worker.state == "hung" and threading.active_count() <= before + 4
-    release.set()
-
-
 @pytest.mark.parametrize("ahead_s", [0.3, 1e6, -1e5])
 def test_stamps_that_are_not_of_this_machine_s_clock_are_refused(ahead_s: float) -> None:
     clock = MonotonicClock()
@@ -237,7 +176,7 @@ def test_stamps_that_are_not_of_this_machine_s_clock_are_refused(ahead_s: float)
         def read_newest(self, timeout_s: float) -> SensorFrame:
             return SensorFrame(1, clock.now_ns() + round(ahead_s * 1e9))
 
-    worker = SensorWorker(lambda: Astray(None, []), SETTINGS, clock)
+    worker = SensorThread(SensorSetup(lambda: Astray(None, []), SETTINGS, clock))
     worker.start()
     try:
         assert eventually(lambda: worker.state == "failed")
@@ -259,7 +198,7 @@ def test_an_sdk_that_fails_or_exits_is_lost_and_reopened(started: Callable[..., 
         time.sleep(0.002)
 
     worker, log = started(act)
-    assert eventually(lambda: worker.reason == f"{type(error).__name__}: {error}")
+    assert eventually(lambda: worker.state and worker.reason == f"{type(error).__name__}: {error}")
     assert worker.state is SensorState.LOST and worker.fault() == worker.reason
     assert eventually(lambda: worker.state is SensorState.RUNNING, within_s=20)
     assert log.count("open") + log.count("open S7") == 3
@@ -293,7 +232,7 @@ class Camera(Scripted):
 def camera(monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.setattr(Camera, "ahead_ns", 0)
     monkeypatch.setattr(Camera, "frozen", "")
-    worker = SensorWorker(lambda: Camera(None, []), SETTINGS, MonotonicClock())
+    worker = SensorThread(SensorSetup(lambda: Camera(None, []), SETTINGS, MonotonicClock()))
     worker.start()
     assert eventually(lambda: worker.state is SensorState.RUNNING)
     yield worker
@@ -301,7 +240,7 @@ def camera(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 def test_future_stamps_are_rejected_and_a_persistent_sensor_counts_as_lost(
-    camera: SensorWorker, monkeypatch: pytest.MonkeyPatch
+    camera: SensorThread, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Once later samples were ignored: 105 mm off, with a sigma of 2 mm."""
     monkeypatch.setattr(Camera, "ahead_ns", 900_000_000)
@@ -317,10 +256,10 @@ def test_future_stamps_are_rejected_and_a_persistent_sensor_counts_as_lost(
 
 @pytest.mark.parametrize("what", ["picture has", "depth picture has", "eye points have"])
 def test_a_sensor_whose_samples_never_change_is_lost_until_they_do(
-    camera: SensorWorker, monkeypatch: pytest.MonkeyPatch, what: str
+    camera: SensorThread, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
     """Frozen eyes were once at rest with a sigma of 0.7 mm. Changing colour does not hide frozen depth."""
-    monkeypatch.setattr("runtime.sensor.worker.FROZEN_NS", 100_000_000)
+    monkeypatch.setattr("runtime.sensor.polling.FROZEN_NS", 100_000_000)
     monkeypatch.setattr(Camera, "frozen", what)
     assert eventually(lambda: camera.state is SensorState.LOST)
     assert camera.fault() == f"the {what} not changed for 0.1 s"
@@ -332,8 +271,8 @@ def test_a_sensor_whose_samples_never_change_is_lost_until_they_do(
 
 
 @pytest.mark.parametrize("still", ["nobody is seen", "nothing is measured", "it may pause"])
-def test_what_may_stay_the_same_is_no_fault(camera: SensorWorker, monkeypatch: pytest.MonkeyPatch, still: str) -> None:
-    monkeypatch.setattr("runtime.sensor.worker.FROZEN_NS", 50_000_000)
+def test_what_may_stay_the_same_is_no_fault(camera: SensorThread, monkeypatch: pytest.MonkeyPatch, still: str) -> None:
+    monkeypatch.setattr("runtime.sensor.polling.FROZEN_NS", 50_000_000)
     if still == "it may pause":
         monkeypatch.setattr(Camera, "capabilities", Capabilities(eye_points=True, may_pause=True))
     monkeypatch.setattr(Camera, "frozen", still)

@@ -1,0 +1,104 @@
+"""Drivers for tests of the sensor's process. One does to the process what a file says."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from runtime.clock import Clock
+from runtime.config import Section
+from runtime.errors import FatalError
+from runtime.records import EyePoints, SensorFrame
+from runtime.sensor.base import Capabilities, Sensor
+
+EYES_M = np.array([[0.7, -0.031, 0.0], [0.7, 0.031, 0.0]])
+
+
+class HarmfulOptions(Section):
+    """Options of the driver."""
+
+    file: str
+    opening: bool = False  # do it in `open`, not in `read_newest`
+
+
+def _loops() -> None:
+    while True:
+        pass
+
+
+def _refuses() -> None:
+    raise FatalError("no such device")
+
+
+DEEDS = {
+    "crash": lambda: ctypes.string_at(0),
+    "die": lambda: os.kill(os.getpid(), signal.SIGKILL),
+    "stop": lambda: os.kill(os.getpid(), signal.SIGSTOP),
+    "loop": _loops,
+    "sleep": lambda: ctypes.CDLL(None).sleep(3600),
+    "exit": lambda: sys.exit("no licence"),
+    "refuse": _refuses,
+}
+
+
+class Harmful(Sensor):
+    """Two eyes that sway, a hundred times a second. It does the deed in its file once, and removes the file."""
+
+    name = "harmful"
+    capabilities = Capabilities(eye_points=True, in_stack_frame=True)
+    Options = HarmfulOptions
+
+    def __init__(self, options: HarmfulOptions, *, clock: Clock) -> None:
+        self._file, self._opening, self._clock, self._count = Path(options.file), options.opening, clock, 0
+
+    def open(self) -> None:
+        self.serial = self.serial or f"H-{os.getpid()}"
+        self._do_deed(self._opening)
+
+    def read_newest(self, timeout_s: float) -> SensorFrame:
+        time.sleep(0.01)
+        self._do_deed(not self._opening)
+        self._count += 1
+        eyes_m = EYES_M + np.array([0.0, 0.002 * np.sin(self._count / 10), 0.0])
+        return SensorFrame(self._count, self._clock.now_ns(), EyePoints(eyes_m, np.ones(2)))
+
+    def _do_deed(self, now: bool) -> None:
+        if now and self._file.exists():
+            deed = self._file.read_text()
+            self._file.unlink()
+            DEEDS[deed]()
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+
+PICTURE_PX = 240, 320
+
+
+class Large(Sensor):
+    """A camera that is faster than its reader, and counts its pictures in a file."""
+
+    name = "large"
+    capabilities = Capabilities(colour=True, may_pause=True)
+
+    def __init__(self, file: Path) -> None:
+        self._file, self._count = file, 0
+
+    def open(self) -> None:
+        """Nothing to open."""
+
+    def read_newest(self, timeout_s: float) -> SensorFrame:
+        time.sleep(0.002)
+        self._count += 1
+        self._file.write_text(str(self._count))
+        picture = np.full((*PICTURE_PX, 3), self._count % 256, np.uint8)
+        return SensorFrame(self._count, time.monotonic_ns(), colour=picture)
+
+    def close(self) -> None:
+        """Nothing to release."""
