@@ -60,7 +60,7 @@ def test_slow_panels_lose_no_sample(tmp_path: Path) -> None:
     hardware.open_sensor(with_options(Settings(), replay=source))
     try:
         worker = hardware._worker
-        assert eventually(lambda: len(worker._queue) >= 5)
+        assert worker is not None and eventually(lambda: bool(worker.state) and len(worker._frames) >= 5)
         seen = [hardware.sample(grid()[0]) for _ in range(5)]
         assert np.diff([sample[0] for sample in seen]).max() < 2 * STEP_NS
     finally:
