@@ -1,4 +1,4 @@
-"""Sources of a live sensor's samples: a process of its own, or a thread for what cannot hang or crash."""
+"""Sources of a live sensor's samples: a separate process, or a thread for what cannot hang or crash."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ class LiveSamples(Samples):
 
 @dataclass(frozen=True, slots=True)
 class SensorSetup:
-    """What a sensor's process needs. The functions are at the top level of a module, or a `partial` of such."""
+    """Parts and settings for polling a sensor. The functions are at the top level of a module, or a `partial` of such."""
 
     make_driver: Callable[[], Sensor]
     settings: SensorSettings
@@ -139,7 +139,7 @@ class _Begin:
 
 
 class SensorProcess(LiveSamples):
-    """Polls a sensor in a process of its own, which is replaced if it crashes or hangs."""
+    """Polls a sensor in a separate process, which is replaced if it crashes or hangs."""
 
     def __init__(self, setup: SensorSetup) -> None:
         """Start the process, which creates the driver. Raises TransientError if no thread can be started."""
