@@ -121,7 +121,7 @@ class LiveSamples(Samples):
 
 @dataclass(frozen=True, slots=True)
 class SensorSetup:
-    """Parts and settings for polling a sensor. The functions are at the top level of a module, or a `partial` of such."""
+    """Parts and settings for polling a sensor. A process needs functions that can be pickled."""
 
     make_driver: Callable[[], Sensor]
     settings: SensorSettings
