@@ -430,10 +430,13 @@ class ServiceSettings(Section):
 
 
 class PoseSettings(Section):
-    """The head pose, sent as OpenTrack's UDP datagrams."""
+    """The head pose, sent as OpenTrack's UDP datagrams or by LSL."""
 
     port: Annotated[int, Field(ge=0, le=65535)] = Field(0, description="UDP port, usually 4242 (0 to send nothing)")
     host: str = Field("127.0.0.1", description="computer to send to, by default this one")
+    lsl: Annotated[str, Field(max_length=100)] = Field(
+        "", description="name of an LSL stream to send to the local network, such as phasestack (empty to send nothing)"
+    )
     rate_hz: Annotated[float, within(1.0, 240.0, "Hz")] = Field(60.0, description="largest number of poses per second")
     smoothing_ms: Annotated[float, within(0.0, 1000.0, "ms")] = Field(
         20.0, description="time constant for smoothing the pose (0 for none)"

@@ -221,7 +221,7 @@ def build_run(
         work_ns=round(sum(stage_ms.get(stage, 0.0) for stage in ("sensor", "track", "present")) * NS_PER_MS),
     )
     pose = []
-    if settings.pose.port and not simulated:
+    if (settings.pose.port or settings.pose.lsl) and not simulated:
         pose.append(PoseSender(settings.pose))
         cleanup.callback(pose[0].close)
     presenter = Presenter(

@@ -1,4 +1,4 @@
-"""Send the viewer's head pose to games and VR drivers, as OpenTrack does by UDP."""
+"""Send the viewer's head pose to other programs, by UDP as OpenTrack does and by LSL."""
 
 from __future__ import annotations
 
@@ -15,11 +15,13 @@ from runtime.config import PoseSettings
 from runtime.errors import InputError
 from runtime.frame.presenter import Refresh
 from runtime.records import F64, Eyes, SensorFrame
+from runtime.support.extras import missing_extra
 
 log = logging.getLogger("phasestack.pose")
 
 DATAGRAM = struct.Struct("<6d")  # x, y, z in centimetres; yaw, pitch, roll in degrees
 CM_PER_M = 100.0
+CHANNELS = {"x": "cm", "y": "cm", "z": "cm", "yaw": "degrees", "pitch": "degrees", "roll": "degrees"}  # with units
 
 
 def pose_of(eyes_m: Eyes, origin_m: tuple[float, float, float]) -> F64:
@@ -42,18 +44,28 @@ class PoseSender:
     """Observer of the loop that sends the pose of a tracked viewer."""
 
     def __init__(self, settings: PoseSettings) -> None:
-        """Open the socket. Raises InputError if the host's name is unknown."""
+        """Open the socket and the LSL stream.
+
+        Raises InputError if the host's name is unknown, and MissingPart if LSL is wanted but not installed.
+        """
         self._settings = settings
+        self._stream = _lsl_stream(settings) if settings.lsl else None
+        self._socket: socket.socket | None = None
+        self._to: tuple[Any, ...] = ()
+        if settings.port:
+            self._open(settings)
+        self._pose: F64 | None = None
+        self._updated_ns = self._sent_ns = -NS_PER_S
+        self._fails = False
+
+    def _open(self, settings: PoseSettings) -> None:
         try:
             kind, _, _, _, to = socket.getaddrinfo(settings.host, settings.port, type=socket.SOCK_DGRAM)[0]
         except OSError as error:
             raise InputError("pose", "host", f"{settings.host}: {error.strerror}") from None
-        self._to: tuple[Any, ...] = to
+        self._to = to
         self._socket = socket.socket(kind, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
-        self._pose: F64 | None = None
-        self._updated_ns = self._sent_ns = -NS_PER_S
-        self._fails = False
 
     def sampled(self, sample: SensorFrame) -> None:
         """Ignore samples: the pose is predicted for the display time, as the pictures are."""
@@ -72,6 +84,10 @@ class PoseSender:
         if (now_ns - self._sent_ns) * self._settings.rate_hz < 0.9 * NS_PER_S:
             return
         self._sent_ns = now_ns
+        if self._stream is not None:
+            self._stream.push_sample(pose.tolist())
+        if self._socket is None:
+            return
         try:
             self._socket.sendto(DATAGRAM.pack(*pose), self._to)
             self._fails = False
@@ -81,5 +97,24 @@ class PoseSender:
             self._fails = True
 
     def close(self) -> None:
-        """Close the socket."""
-        self._socket.close()
+        """Close the socket and the stream."""
+        if self._socket is not None:
+            self._socket.close()
+        self._stream = None  # LSL closes a stream without references
+
+
+def _lsl_stream(settings: PoseSettings) -> Any:
+    """Return an LSL stream for poses, which announces itself to the network. Raises MissingPart if it is impossible."""
+    try:
+        import pylsl
+    except ImportError as error:
+        raise missing_extra(error) or error from None
+    about = pylsl.StreamInfo(
+        settings.lsl, "Pose", len(CHANNELS), pylsl.IRREGULAR_RATE, "double64", f"phasestack-{socket.gethostname()}"
+    )
+    channels = about.desc().append_child("channels")
+    for name, unit in CHANNELS.items():
+        channel = channels.append_child("channel")
+        channel.append_child_value("label", name)
+        channel.append_child_value("unit", unit)
+    return pylsl.StreamOutlet(about)

@@ -66,9 +66,9 @@ def test_yaw_is_to_the_right_and_roll_to_the_right_shoulder(yaw_deg: float, roll
     np.testing.assert_allclose(pose_of(turned(yaw_deg, roll_deg), ORIGIN_M)[3:], (yaw_deg, 0, roll_deg), atol=1e-9)
 
 
-def run_for_a_second(folder: Path, port: int) -> tuple[list[dict], str]:
+def run_for_a_second(folder: Path, port: int, more: str = "") -> tuple[list[dict], str]:
     """The lines of frames.jsonl of a run with a walking viewer on the real clock, and what it wrote to stderr."""
-    (folder / "c.toml").write_text(CONFIG.format(socket=folder / "s", port=port))
+    (folder / "c.toml").write_text(CONFIG.format(socket=folder / "s", port=port) + more)
     recording = str(folder / "walk.mcap")
     command = [sys.executable, "-c", AUDITED]
     subprocess.run([*command, "record", "--motion", "walk", "--seconds", "3", "--out", recording], check=True)
@@ -106,13 +106,36 @@ def test_a_receiver_gets_the_poses_of_the_frames(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_an_lsl_recorder_gets_the_poses(tmp_path: Path) -> None:
+    pylsl = pytest.importorskip("pylsl")
+    name, received = f"pose of {tmp_path.name}", []
+
+    def receive() -> None:
+        (found,) = pylsl.resolve_byprop("name", name, timeout=60)
+        inlet = pylsl.StreamInlet(found)
+        labels = inlet.info().desc().child("channels").child("channel").child_value("label")
+        while (pose := inlet.pull_sample(timeout=3.0)[0]) is not None:
+            received.append(pose)
+        received.append(labels)
+
+    thread = threading.Thread(target=receive)
+    thread.start()
+    lines, _ = run_for_a_second(tmp_path, 0, more=f'lsl = "{name}"')
+    thread.join()
+    poses = [pose_of(np.array(line["eyes_m"]), ORIGIN_M) for line in lines if line["eyes_m"] is not None]
+    assert received.pop() == "x" and len(received) > 10
+    for pose in received:
+        assert min(np.abs(np.subtract(pose, one)).max() for one in poses) < 1e-3  # the file is rounded
+
+
+@pytest.mark.slow
 def test_nothing_is_sent_unless_it_is_told_to(tmp_path: Path) -> None:
     lines, told = run_for_a_second(tmp_path, 0)
     assert any(line["eyes_m"] is not None for line in lines) and "SENT" not in told
 
 
 def test_poses_go_to_this_computer_unless_told_otherwise() -> None:
-    assert (PoseSettings().host, PoseSettings().port) == ("127.0.0.1", 0)
+    assert (PoseSettings().host, PoseSettings().port, PoseSettings().lsl) == ("127.0.0.1", 0, "")
 
 
 def test_an_unknown_host_is_refused_in_one_line() -> None:
