@@ -21,7 +21,7 @@ from runtime.commands.app import app
 from runtime.config import Settings, with_options
 from runtime.daemon import supervise
 from runtime.daemon.build import RunOptions
-from runtime.daemon.drive import drive
+from runtime.daemon.drive import drive, headline_lines
 from runtime.errors import InputError
 from runtime.evaluation.run_output import RunOutput
 from runtime.eyes.calibration import demo_sensor_from_stack
@@ -277,6 +277,17 @@ def test_the_demo_ends_in_time_and_says_so_with_one_figure(
     assert re.search(r"\d steps? on (all pixels|half the rows and columns)", told) and "1/1+" not in told
     assert (summary["clock"], summary["scene"]) == ("simulated", "room")
     assert list(summary)[:2] == ["clock", "configured"]
+
+
+def test_the_headline_names_three_efforts_and_sums_up_the_others() -> None:
+    efforts = {"1/1+2": 6.0, "1/2+1": 0.2, "1/1+4": 3.0, "1/3+0": 0.3, "1/4+0": 0.5}
+    summary = dict.fromkeys(("live_db", "light_db", "view_error_mm")) | {
+        "inferences": 3, "configured": True, "dropped": 0, "presented": 9, "model": "fast", "backend": "cpu",
+        "states": {"tracking": 10.0}, "stopped": "done", "efforts": efforts,
+    }  # fmt: skip
+    _, _, model, *_ = headline_lines(summary)
+    assert [part.rpartition(" for ")[2] for part in model.split(", ")] == ["60%", "30%", "5%", "5%"]
+    assert ", others for 5%" in model
 
 
 def test_a_run_that_could_not_write_its_files_does_not_end_well(

@@ -18,10 +18,14 @@ def report(
     ] = False,
     layers: Annotated[
         list[Path] | None,
-        typer.Option(help="folder with another solver's layers and times for the case files (can be repeated)"),
+        typer.Option(
+            metavar="<path>", help="folder with another solver's layers and times for the case files (can be repeated)"
+        ),
     ] = None,
     focal: Annotated[bool, typer.Option("--focal", help="also measure focal parallax through the layers")] = False,
-    model: Annotated[list[str] | None, typer.Option(help="additional ONNX file to compare (can be repeated)")] = None,
+    model: Annotated[
+        list[str] | None, typer.Option(metavar="<path>", help="additional ONNX file to compare (can be repeated)")
+    ] = None,
     quick: Annotated[
         bool, typer.Option("--quick", help="measure only quarter-size panels and fewer reference methods")
     ] = False,

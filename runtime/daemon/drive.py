@@ -21,6 +21,7 @@ from runtime.support.background import wait_for_all
 from runtime.support.figures import effort_in_words, lines_of
 
 JOBS_END_WITHIN_S = 0.5  # how long to wait for background jobs at the end of a run
+EFFORTS_SHOWN = 3  # number of efforts to name; their shares of the time are largest
 USUAL_M, IPD_M = 0.6, 0.063  # a typical viewer's distance and eye separation, used if no viewer was seen
 
 
@@ -120,7 +121,9 @@ def headline_lines(summary: dict[str, Any], *, asked: int | None = None) -> Iter
     yield f"shown      {summary['presented']}{of} refreshes{pace}{lost}; {summary['inferences']} solutions"
     efforts = sorted((summary["efforts"] or {}).items(), key=lambda item: -item[1])
     total_s = sum(seconds for _, seconds in efforts)
-    shares = [f"{effort_in_words(name)} for {100 * seconds / total_s:.0f}%" for name, seconds in efforts if seconds > 0]
+    most = [(effort_in_words(name), seconds) for name, seconds in efforts[:EFFORTS_SHOWN]]
+    most += [("others", sum(seconds for _, seconds in efforts[EFFORTS_SHOWN:]))]
+    shares = [f"{what} for {100 * seconds / total_s:.0f}%" for what, seconds in most if seconds > 0]
     yield f"model      {summary['model']} on the {summary['backend']}{': ' if shares else ''}{', '.join(shares)}"
     states = [f"{name} {seconds:.1f} s" for name, seconds in summary["states"].items() if seconds >= 0.05]
     yield f"states     {', '.join(states)}"
