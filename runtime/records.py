@@ -183,11 +183,12 @@ class Effort:
     reduction: int = 1  # divisor of the panels' rows and columns
     steps: int = 0  # updates of all panels
     continued_from: int | None = None  # number of steps in the solution being continued; None: a new solution
+    focus: bool = False  # True if points of the pupils have separate pictures
 
     @property
     def name(self) -> str:
-        """Short name of the effort, such as `1/2+1` for half the rows and columns and one step."""
-        return f"1/{self.reduction}+{self.steps}"
+        """Short name of the effort, such as `1/2+1`: half the rows and columns, one step; `f`: focus."""
+        return f"1/{self.reduction}+{self.steps}{'f' * self.focus}"
 
 
 @dataclass(frozen=True, slots=True)

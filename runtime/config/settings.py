@@ -251,6 +251,11 @@ class ContentSettings(Section):
         (-0.05, 0.05),
         description="rear and front limits of an RGBD picture's depth; `fit` scales meshes to at most twice this range",
     )
+    focus: Literal["off", "auto", "on"] = Field(
+        "off",
+        description="while the head is at rest, separate pictures for points of the pupils, so that eyes can focus in "
+        "depth: `auto` for content known to lie between the panels, `on` for any that can be drawn from any place",
+    )
     picture_rate_hz: Annotated[float, within(0.01, 1000.0, "Hz")] = Field(
         30.0, description="frame rate of a folder of pictures"
     )

@@ -121,7 +121,7 @@ class EyeRealSource(ContentSource):
         self._loaded = lru_cache(KEPT)(self._load)
         self._chosen = 0
         self._loaded(0)
-        self.info = ContentInfo(name=name, background=background)
+        self.info = ContentInfo(name=name, background=background, fixed_views=True)
 
     def render(self, view: View, *, time_ns: int) -> U8:
         if view.side == 0:  # the right eye sees the pair that was chosen for the left eye

@@ -87,7 +87,7 @@ class LiveSource(ContentSource):
     def __init__(self, feed: Feed, *, file: SceneFile, context: object = None) -> None:
         """Start the feed, which the source owns from now on."""
         self._feed, self._file = feed, file
-        self.info = ContentInfo(feed.name, moving=True, background=file.background)
+        self.info = ContentInfo(feed.name, moving=True, background=file.background, fixed_views=True)
         self._at = 0
         self._views: list[U8] = []
         self._shown: dict[int, WarpedPicture] = {}

@@ -58,6 +58,7 @@ class PicturesSource(ContentSource):
             grey=not moving and _is_grey(first),
             background=file.background,
             flat_x_m=0.0 if mono else None,
+            fixed_views=True,
         )
 
     def render(self, view: View, *, time_ns: int) -> U8:

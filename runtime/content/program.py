@@ -62,7 +62,7 @@ class ProgramSource(ContentSource):
         """Create a source that gives the server back when it is closed."""
         self._server, self._display_m = server, display_m
         self._shown: dict[int, ProgramPicture] = {}  # latest pictures, keyed by side
-        self.info = ContentInfo("program", moving=True, background=background)
+        self.info = ContentInfo("program", moving=True, background=background, fixed_views=True)
         self._expected: tuple[int, list[View]] | None = None  # number and views of the requested frame
         self._released = weakref.finalize(self, release, server)
 

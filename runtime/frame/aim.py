@@ -12,6 +12,7 @@ from runtime.config import Settings
 from runtime.frame.effort import HORIZON_S, Costs, EffortChooser, Outlook, candidates, display_spread_s
 from runtime.frame.solver_host import SolverHost
 from runtime.frame.viewer import Viewer
+from runtime.plan.focusing import may_focus
 from runtime.plan.savings import selected_eyes
 from runtime.records import F64, Effort, EyesEstimate, EyesLabel, FrameTiming, Solution, SolveRequest
 
@@ -19,6 +20,7 @@ HORIZON_NS = NS_PER_S // 8  # how far ahead the eyes are predicted at most, from
 SPEED_NS = NS_PER_S // 2  # time constant for the running mean of the head's squared speed
 REQUESTS_KEPT = 256
 CALM_M_S = 0.02  # a seated viewer's head sways more slowly than this; deliberate movements are faster
+FOCUS_SHARE = 0.25  # a resting head's solution gets focus if this takes less than this share of the expected rest
 WORTH = 0.995  # refine only if the expected error would fall below this share of the current error
 
 
@@ -118,6 +120,8 @@ class Aim:
             if shown is not None and eyes.label == "rested":
                 most = facts.refined_steps
                 refined = self._refined(shown, most, costs, shown_error=error, horizon_s=horizon_s)
+                if refined is None and may_focus(facts.info, settings.content.focus):
+                    refined = focused(shown, most, costs, horizon_s=horizon_s)
             cost_ms = costs.ms(effort)
             expected_m2 = outlook(cost_ms).moved_m2(display_spread_s(cost_ms, period_ms=period_ms))
         cost_ns = round(costs.ms(effort) * NS_PER_MS)
@@ -236,3 +240,18 @@ class Aim:
         means = {effort: mean(pictures.own(effort), costs.ms(effort), **horizon) for effort in efforts}
         best = min(means, key=means.__getitem__)
         return best if means[best] < WORTH * shown_error else None
+
+
+def focused(shown: Solution, most: int, costs: Costs, *, horizon_s: float) -> Effort | None:
+    """Return the effort that gives a resting head's solution focus, or None if there is no need or no time.
+
+    Args:
+        shown: The solution, which cannot be refined otherwise.
+        most: Number of steps for the new solution.
+        costs: Solution costs.
+        horizon_s: How long the head is expected to stay at rest, in seconds.
+    """
+    if shown.effort is None or shown.effort.reduction > 1 or shown.effort.focus or most < 1:
+        return None
+    effort = Effort(1, most, focus=True)
+    return effort if costs.ms(effort) < FOCUS_SHARE * 1e3 * horizon_s else None

@@ -26,6 +26,7 @@ from dataclasses import dataclass, field
 from runtime.records import Effort, Measures
 
 SOLVING_STAGES = ("render", "prepare", "inference", "finish", "step")
+FOCUS_DRAWN, FOCUS_STEP = 5, 3  # with focus, the drawn pictures per eye, and a step's cost relative to one without
 REST = "rest"  # time between two solutions that belongs to no stage, for measurements and for waking up
 HORIZON_S = 1.0  # how long head and content are assumed to continue as they are
 EQUAL = 1.05  # the fastest effort with a mean error at most this many times the lowest is chosen
@@ -66,7 +67,11 @@ class Costs:
         stages = self.stages.get(effort.reduction, {})
         steps = effort.steps - (effort.continued_from or 0)
         begun = ("finish", REST) if effort.continued_from is not None else (*SOLVING_STAGES[:-1], REST)
-        return sum(stages.get(stage, 0.0) for stage in begun) + steps * stages.get("step", 0.0)
+        step_ms = stages.get("step", 0.0)
+        if not effort.focus:
+            return sum(stages.get(stage, 0.0) for stage in begun) + steps * step_ms
+        drawn_ms = (FOCUS_DRAWN - 1) * stages.get("render", 0.0)
+        return sum(stages.get(stage, 0.0) for stage in begun) + steps * FOCUS_STEP * step_ms + drawn_ms
 
 
 def simulated_costs(stage_ms: Mapping[str, float], reductions: Iterable[int]) -> Costs:
@@ -98,7 +103,9 @@ class CostBook:
         self._unused: dict[int, int] = {}  # solutions on other rasters since this one's last use, by reduction
 
     def learn(self, effort: Effort, stage_ms: Mapping[str, float]) -> None:
-        """Update the means with one solution's stage times, in milliseconds."""
+        """Update the means with one solution's stage times, in milliseconds, unless it has focus."""
+        if effort.focus:
+            return
         self._unused = {by: count + 1 for by, count in self._unused.items()} | {effort.reduction: 0}
         self._measured = {by: means for by, means in self._measured.items() if self._unused[by] < KEPT_SOLUTIONS}
         if effort.reduction not in self._measured:

@@ -115,7 +115,7 @@ def _is_more(effort: Effort | None, done: Effort | None) -> bool:
         return False
     if effort.continued_from is not None and effort.reduction != done.reduction:
         return False
-    return (-effort.reduction, effort.steps) > (-done.reduction, done.steps)
+    return (-effort.reduction, effort.focus, effort.steps) > (-done.reduction, done.focus, done.steps)
 
 
 def wants_flat(eyes: EyesEstimate, *, flat_asked: bool, flatness: float) -> bool:

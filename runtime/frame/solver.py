@@ -21,6 +21,7 @@ from runtime.model.targets import flat_layers
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import raster_from_stack
 from runtime.plan.drawing import drawn_job
+from runtime.plan.focusing import focused_job
 from runtime.plan.savings import Measured, Plan, make_plan, seeing_eyes
 from runtime.records import F64, U8, Effort, Eyes, Solution, SolveRequest
 from runtime.support.gl import DrawnPicture
@@ -135,6 +136,13 @@ class Solver:
                 job = self._kept
             else:
                 job = self._drawn(state, request, eyes_m, effort.reduction)
+            if effort.focus:
+                focused = focused_job(state.content, job, time_ns=request.time_ns, focus=state.settings.content.focus)
+                if focused is None:  # the present solution stays, and is not asked for again
+                    assert self._solved is not None and self._solved.effort is not None
+                    self._solved = replace(self._solved, effort=replace(self._solved.effort, focus=True))
+                    return SolverUpdate(missing=dict(self._missing))
+                job = focused
         except ContextLost:  # content and model were lost with it, so the owner must start another solver
             raise
         except (Exception, SystemExit) as error:
@@ -147,7 +155,7 @@ class Solver:
             raise
         except (Exception, SystemExit) as error:
             return SolverUpdate(missing=self._failed("model", error, expected=ModelFailure))
-        effort = Effort(effort.reduction, prediction.steps, prediction.continued_from)
+        effort = Effort(effort.reduction, prediction.steps, prediction.continued_from, effort.focus)
         self._missing = {}
         self._windows[effort.reduction] = job.window if job.window is not None and job.window.box.width_px else None
         self.measured = replace(self.measured, left_out=prediction.savings)
@@ -162,7 +170,9 @@ class Solver:
             eye_sigma_m=sigma_m,
             stage_ms=watch.stage_ms,
             effort=effort,
-            measures=self._meter.measure(job, prediction.layers, effort, time_ns=request.time_ns),
+            measures=None
+            if effort.focus
+            else self._meter.measure(job, prediction.layers, effort, time_ns=request.time_ns),
             relief=job.relief,
             state_version=state.version,
         )

@@ -152,6 +152,8 @@ def test_it_never_leaves_its_range_nor_passes_where_it_goes(story: list[tuple[fl
         (Effort(1, 4), Effort(1, 5), "refine"),
         (Effort(1, 4), Effort(1, 5, continued_from=4), "refine"),
         (Effort(2, 4), Effort(1, 0), "refine"),
+        (Effort(1, 4), Effort(1, 4, focus=True), "refine"),
+        (Effort(1, 4, focus=True), Effort(1, 8, continued_from=4), "nothing"),
         (Effort(2, 4), Effort(3, 9), "nothing"),
         (Effort(2, 4), Effort(1, 5, continued_from=4), "nothing"),  # was chosen for a solution on another raster
         (Effort(1, 4), None, "nothing"),

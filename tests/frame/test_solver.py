@@ -10,14 +10,17 @@ import pytest
 
 from runtime.clock import NS_PER_S
 from runtime.config import ContentSettings, Settings, changed
-from runtime.content.base import ContentSource
+from runtime.content import shapes
+from runtime.content.base import ContentInfo, ContentSource, View
+from runtime.content.procedural import ProceduralSource
 from runtime.content.registry import open_content
+from runtime.content.scenes import Scene, Thing
 from runtime.errors import ContentFailure, ModelFailure
 from runtime.frame.run_state import SceneCell
 from runtime.frame.solver import Solver, SolverUpdate
 from runtime.model.predictor import Predictor
 from runtime.plan.drawing import drawn_job
-from runtime.records import Effort, SolveRequest
+from runtime.records import U8, Effort, SolveRequest
 from tests.frame.conftest import SMALL
 from tests.frame.fakes import EYES, aside
 
@@ -229,3 +232,46 @@ def test_a_fault_that_is_over_is_cleared_without_new_work(
         broken(content, "revision", ContentFailure("busy"), patch)
         assert solver.step(wish()).missing == {"content": "busy"}
     assert solver.step(wish()).missing == {}
+
+
+@pytest.mark.parametrize(
+    ("scene", "focus", "gets"),
+    [("demo", "on", True), ("demo", "auto", False), ("flat card", "auto", True), ("pair", "on", False)],
+)
+def test_content_that_qualifies_gets_focus_and_no_other(
+    solver: Solver, cell: SceneCell, shared_context: Any, scene: str, focus: str, gets: bool
+) -> None:
+    """The demo scene reaches behind the rear panel; a pair has no other views."""
+    settings = changed(cell.state.settings, "content", {"focus": focus}, source="test")
+    card = shapes.card(0.1, 0.05)
+    content = (
+        Pair()
+        if scene == "pair"
+        else ProceduralSource(
+            "demo" if scene == "demo" else Scene("card", (Thing(card, "checker", (0.05, 0.0, 0.0), (1, 1, 1)),)),
+            stack=SMALL,
+            context=shared_context,
+        )
+    )
+    cell.replace(content=content, settings=settings)
+    resting = replace(wish(), eyes_label="rested")
+    plain = solver.step(resting).solution
+    for _ in range(2):  # the second time, nothing is left to do
+        focused = solver.step(replace(resting, refined_to=Effort(1, 2, focus=True))).solution
+        assert (focused is not None) == gets
+        if focused is not None:
+            assert focused.effort == Effort(1, 2, focus=True)
+            assert not np.array_equal(focused.layers, plain.layers)
+            assert np.array_equal(focused.solved_for_m, EYES)
+        gets = False
+    content.close()
+
+
+class Pair(ContentSource):
+    """Two grey pictures, whatever the eyes see."""
+
+    def __init__(self) -> None:
+        self.info = ContentInfo("pair", fixed_views=True)
+
+    def render(self, view: View, *, time_ns: int) -> U8:
+        return np.full((view.height_px, view.width_px, 4), 60 + 100 * view.side, np.uint8)
