@@ -243,7 +243,7 @@ class Aim:
 
 
 def focused(shown: Solution, most: int, costs: Costs, *, horizon_s: float) -> Effort | None:
-    """Return the effort that gives a resting head's solution focus, or None if there is no need or no time.
+    """Return the effort that gives a resting head's solution focus; None if not needed or too slow.
 
     Args:
         shown: The solution, which cannot be refined otherwise.

@@ -1,4 +1,4 @@
-"""Draw separate pictures for points of the pupils, so that eyes can focus on content off the middle panel.
+"""Draw separate pictures for points of the pupils, so that eyes can focus at a depth.
 
 `content.focus` decides which content gets them: `auto` takes content that is known to lie between the panels, `on`
 takes any that can be drawn from any place. Stereo pairs, films and programs have two views and never qualify.
