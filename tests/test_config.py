@@ -68,7 +68,7 @@ PANEL = '[[output.panels]]\nconnector = "DP-{}"\n'
         ("[plan]\nenabled = 'maybe'", "plan.enabled", "Input should be true or false"),
         ("[stack]\nwidth_px = 'wide'", "stack.width_px", "Input should be a whole number"),
         ("[stack]\nx_m = [0]", "stack.x_m", "must have at least 2 items"),
-        ("[stack]\nx_m = [0, 1, 2, 3, 4, 5, 6, 7, 8]", "stack.x_m", "must have at most 6 items"),
+        ("[stack]\nx_m = [0, 1, 2, 3, 4, 5, 6]", "stack.x_m", "must have at most 6 items"),
         (
             '[content]\nlayout = "foo"',
             "content.layout",
