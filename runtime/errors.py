@@ -22,9 +22,10 @@ PASSING = frozenset(
 
 
 def without_secrets(text: str) -> str:
-    """Return the text with any user names and passwords before an `@` in URLs removed. >>>
-    without_secrets("rtsp://user:a@b@host/door"), without_secrets("/etc/rtsp:/user:a@host/door") ('rtsp://host/door',
-    '/etc/rtsp:/host/door')
+    """Return the text with any user names and passwords before an `@` in URLs removed.
+
+    >>> without_secrets("rtsp://user:a@b@host/door"), without_secrets("/etc/rtsp:/user:a@host/door")
+    ('rtsp://host/door', '/etc/rtsp:/host/door')
     """
     return _USER_OF_ADDRESS.sub(r"\1", text) if ":/" in text else text
 
@@ -54,8 +55,10 @@ class FatalError(PhasestackError):
 
 
 class InputError(FatalError):
-    """Invalid input from a user. The message names the file or option, and the invalid field. >>>
-    str(InputError("panels.toml", "x_m", "must ascend")) 'panels.toml: x_m: must ascend'
+    """Invalid input from a user. The message names the file or option, and the invalid field.
+
+    >>> str(InputError("panels.toml", "x_m", "must ascend"))
+    'panels.toml: x_m: must ascend'
     """
 
     def __init__(self, source: str | Path, field: str, problem: str) -> None:

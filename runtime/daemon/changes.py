@@ -64,10 +64,8 @@ class Choices:
         return replace(self, chosen=kept).choosing("content", scene=scene)
 
     def reloaded(self, read: Callable[[], Settings]) -> Choices:
-        """Return a copy with the configuration returned by `read`.
-
-        A choice is kept only if the setting is the same in the new configuration as in the old one. Raises InputError
-        if the new configuration is invalid or if it changes a setting that requires a restart.
+        """Return a copy with another configuration, in which choices are kept if their settings are equal.
+        Raises InputError if the new configuration is invalid or changes a setting that requires a restart.
         """
         settings, before = read(), self.configured
         frozen = [name for name in NEEDS_RESTART if attrgetter(name)(settings) != attrgetter(name)(before)]
@@ -101,10 +99,7 @@ class _Loading:
     progress: str = ""  # what is being loaded, for the status
 
     def read(self, before: Choices) -> tuple[Choices, Settings, Calibration]:
-        """Apply the change to the previous choices, and read what belongs to it.
-
-        Raises InputError if the new settings are invalid.
-        """
+        """Apply the change to the previous choices, and read what belongs to it. Raises InputError."""
         choices = self.choose(before)
         settings = choices.settings()
         file = settings.calibration.file
@@ -112,10 +107,9 @@ class _Loading:
 
 
 class Changes:
-    """Carries out operators' changes to a run, loading one change at a time.
-
-    For use only on the presenter's thread. Settings are read by a background job, and new content and a new model are
-    loaded by the solver. `carry_on` polls the job, and the solver's host passes on the answers. Neither waits.
+    """Carries out operators' changes to a run, loading one change at a time. For use only on the
+    presenter's thread. Settings are read by a background job, and new content and a new model are loaded by the solver.
+    `carry_on` polls the job, and the solver's host passes on the answers. Neither waits.
     """
 
     def __init__(self, presenter: Presenter) -> None:
@@ -145,12 +139,9 @@ class Changes:
             self.attempt(following.command, partial(self._load, following))
 
     def begin(self, command: Command, choose: Callable[[Choices], Choices], *, reload_content: bool = False) -> None:
-        """Start a change, or replace one that is still loading.
-
-        Args:
-            command: Command to answer once the change is over.
-            choose: Function that returns the new choices, given the current ones. Called on the reading thread.
-            reload_content: True to reload the content even if its settings have not changed.
+        """Start a change, or replace one that is still loading, and answer the command once it is over.
+        `choose` maps the current choices to the new ones, on the reading thread. `reload_content` reloads it in any
+        case.
         """
         following = _Loading(command, choose, reload_content)
         loading = self._loading
@@ -166,10 +157,7 @@ class Changes:
         self._next = following
 
     def place(self, command: Command) -> None:
-        """Move the scene as requested. Raises InputError if the placement is invalid.
-
-        The solver replaces the settings and the content together, between two solutions.
-        """
+        """Move the scene as requested, between two solutions. Raises InputError if the placement is invalid."""
         values = command.value or status.placing_in(self.choices.configured)
         changed(self._presenter.solver.facts.settings, "content", values, source="place")
 
@@ -191,12 +179,7 @@ class Changes:
             self.answer(command, problem)
 
     def answer(self, command: Command, problem: str) -> None:
-        """Report a command's outcome to its client and in the status. If it was refused, also log this.
-
-        Args:
-            command: Command to answer.
-            problem: Why the command was refused, or an empty string if it succeeded.
-        """
+        """Report a command's outcome to its client and in the status; log a problem, "" if it succeeded."""
         problem = problem.removeprefix(OWN_PREFIX.get(command.name, ""))
         self.refused = problem
         if problem:
@@ -243,13 +226,7 @@ class Changes:
             self.answer(loading.command, problem)
 
     def _order(self, command: Command, order: Order, succeeded: Callable[[], None] = lambda: None) -> None:
-        """Send an order to the solver, and answer the command once it has been carried out.
-
-        Args:
-            command: Command to answer.
-            order: What to do between two solutions.
-            succeeded: Function called before the command is answered, if the order was carried out.
-        """
+        """Send an order to the solver, and answer the command, after calling `succeeded`, once it is carried out."""
 
         def answered(answer: Answer) -> None:
             assert isinstance(answer, Done)

@@ -41,10 +41,7 @@ def candidates(configured: str) -> tuple[Path, ...]:
 
 
 def sockets(config: Path | None) -> tuple[Path, ...]:
-    """Return the sockets to try for a given configuration file, or the default ones if `config` is None.
-
-    Raises InputError if the file is invalid.
-    """
+    """Return the sockets to try for a configuration file, or the default ones. Raises InputError."""
     if config is None:
         return candidates(DEFAULT_SOCKET)  # do not load the settings, because that would slow clients down
     from runtime.config import load_settings
@@ -59,15 +56,8 @@ class NotRunning(TransientError):
 
 
 def ask(paths: Iterable[Path], request: dict[str, Any], *, timeout_s: float = 10.0) -> dict[str, Any]:
-    """Send a request to the first socket where a daemon answers, and return the answer.
-
-    Args:
-        paths: Sockets to try, in this order.
-        request: The request, to be sent as JSON.
-        timeout_s: Time limit for each socket operation.
-
-    Raises:
-        NotRunning: No daemon answers on any of the sockets.
+    """Send a JSON request to the first socket where a daemon answers, and return the answer. `timeout_s`
+    limits each socket operation. Raises NotRunning if no daemon answers on any of the sockets.
     """
     problems, hangs = [], False
     for path in paths:
@@ -82,10 +72,7 @@ def ask(paths: Iterable[Path], request: dict[str, Any], *, timeout_s: float = 10
 
 
 def _exchanged(path: Path, request: dict[str, Any], timeout_s: float) -> dict[str, Any]:
-    """Send a request as one JSON line and return the decoded answer.
-
-    Raises OSError if the connection fails, and ValueError if the answer is not a JSON object.
-    """
+    """Send a JSON line and return the decoded answer. Raises OSError, or ValueError if it is not a JSON object."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as channel:
         channel.settimeout(timeout_s)
         channel.connect(str(path))
@@ -158,9 +145,8 @@ class DaemonClient:
         self._answers: dict[str, tuple[float, dict[str, Any]]] = {}
 
     def look_up(self, name: str) -> dict[str, Any]:
-        """Return the answer, possibly cached, to a `status`, `pictures`, `log` or `about` request.
-
-        If no daemon answers, the returned `ok` is False.
+        """Return the possibly cached answer to `status`, `pictures`, `log` or `about`, with `ok` False if
+        none.
         """
         with self._locks[name]:
             asked_s, answer = self._answers.get(name, (float("-inf"), {}))

@@ -22,9 +22,8 @@ PLACING = (
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A command, started by the loop between two refreshes and answered exactly once.
-
-    Do not carry out a command unless `take` has returned True, because the client may have given up.
+    """A command, started by the loop between two refreshes and answered exactly once. Do not carry out a
+    command unless `take` has returned True, because the client may have given up.
     """
 
     name: Name
@@ -45,9 +44,8 @@ class Command:
 
 
 def parse(request: Any) -> Command:
-    """Return the command contained in a request from the socket.
-
-    Raises ValueError, with a one-line message, if the request is not a valid command.
+    """Return the command in a request from the socket. Raises ValueError, with one line, if it is
+    invalid.
     """
     if not isinstance(request, dict):
         raise ValueError("a request must be one JSON object")

@@ -27,8 +27,7 @@ USUAL_M, IPD_M = 0.6, 0.063  # a typical viewer's distance and eye separation, u
 
 def drive(settings: Settings, options: RunOptions, host: Host | None = None) -> dict[str, Any]:
     """Build a run, run the display loop to its end, write the output files and return the summary.
-
-    If the output files could not be written, `output_problem` in the returned summary gives the reason.
+    `output_problem` in the summary gives the reason if the output files could not be written.
     """
     done = 0
 
@@ -84,13 +83,8 @@ def _unseen(layers: U8, account: RefreshAccount, run: Run, settings: Settings) -
 def print_summary(
     summary: dict[str, Any], out: Path | None, *, asked: int | None = None, verbose: bool = False
 ) -> None:
-    """Print what a run came to, with one figure of quality, and where to look at the result.
-
-    Args:
-        summary: The run's summary.
-        out: The run's output folder.
-        asked: Number of refreshes that were to be shown. None: as many as there are.
-        verbose: Print all figures first.
+    """Print a run's result, with one or all figures, and where to look at it. `asked` is the number of
+    refreshes requested, by default all.
     """
     if verbose:
         _print_figures(summary)

@@ -18,10 +18,8 @@ class Notifier:
     """Sends the daemon's status and watchdog messages to systemd. Its methods never block or raise."""
 
     def __init__(self, clock: Clock, environment: Mapping[str, str] = os.environ) -> None:
-        """Connect to systemd if it runs this process.
-
-        Args:
-            environment: Environment variables, which give the watchdog period (see sd_watchdog_enabled).
+        """Connect to systemd, whose variables give the watchdog period (see sd_watchdog_enabled), if it runs this
+        process.
         """
         self._clock = clock
         self._channel: Any = None
@@ -72,11 +70,6 @@ class Notifier:
         working, because while it fails or restarts, the last solution stays on the panels and is still aligned to the
         eyes. Before READY, the startup timeout applies instead. During the first hundred refreshes, the watchdog period
         is longer.
-
-        Args:
-            state: The presenter's state.
-            missing: Names of the parts that have failed.
-            presented: True if the panels showed the refresh.
         """
         alive = presented or (state is State.DEGRADED and "panel" in missing)
         if not (alive and self._watchdog_ns):

@@ -41,23 +41,13 @@ class Refusal(Exception):
 
 
 class StatusServer:
-    """Answers `status` from the latest published snapshot, and queues commands for the loop.
-
-    The presenter's loop calls `publish` and takes from `commands`, and never waits for a client. Even if the loop
-    hangs, status requests are answered, and each answer gives the time since the loop's last turn.
+    """Answers `status` from the latest published snapshot, and queues commands for the loop. The
+    presenter's loop calls `publish` and takes from `commands`, and never waits for a client. Even if the loop hangs,
+    status requests are answered, and each answer gives the time since the loop's last turn.
     """
 
     def __init__(self, path: Path, *, clock: Clock) -> None:
-        """Create the socket and start serving.
-
-        Args:
-            path: Path to the socket.
-
-        Raises:
-            SocketInUse: Another phasestack process is using the socket.
-            InputError: The socket cannot be created.
-            TransientError: The thread cannot be started.
-        """
+        """Create the socket and start serving. Raises SocketInUse, InputError, or TransientError without a thread."""
         self.path = path
         self.commands: queue.SimpleQueue[Command] = queue.SimpleQueue()
         self.lookups: dict[str, Callable[[], dict[str, Any]]] = {}  # by request; called on the server's thread
@@ -75,10 +65,9 @@ class StatusServer:
         self._thread: threading.Thread | None = begin("status", self._run)
 
     def publish(self, snapshot: Callable[[], dict[str, Any]]) -> None:
-        """Set the function that creates the status. Called once per loop turn.
-
-        The function is called on the server's thread, and only when a client requests the status, so without requests a
-        turn costs nothing. It may read only values that no longer change.
+        """Set the function that creates the status. Called once per loop turn. The function is called on the
+        server's thread, and only when a client requests the status, so without requests a turn costs nothing. It may
+        read only values that no longer change.
         """
         self._snapshot = (self._clock.now_ns(), snapshot)
 
@@ -161,10 +150,7 @@ class StatusServer:
             writer.close()
 
     def _make_room(self) -> None:
-        """If all connections are in use, disconnect the client with the oldest incomplete request.
-
-        Raises Refusal if no client has an incomplete request.
-        """
+        """If all connections are in use, disconnect the one with the oldest incomplete request, or raise Refusal."""
         if len(self._clients) >= CLIENTS_MAX:
             longest = next(iter(self._reading), None)
             if longest is None:
@@ -174,10 +160,7 @@ class StatusServer:
             longest.cancel("too many clients are connected")
 
     async def _request(self, reader: StreamReader, task: asyncio.Task[None]) -> bytes:
-        """Return the next request, including its newline. At end of input, it may be incomplete.
-
-        Raises Refusal if a request is too long or does not arrive in time.
-        """
+        """Return the next request with its newline, or what remains at end of input. Raises Refusal if long or late."""
         self._reading[task] = None
         try:
             async with asyncio.timeout(REQUEST_S):
@@ -226,10 +209,8 @@ def _is_gone(writer: StreamWriter) -> bool:
 
 
 async def _outcome(command: Command, writer: StreamWriter) -> dict[str, Any]:
-    """Wait for a command's outcome and return the answer.
-
-    The command is cancelled if the loop does not start it in time or the client disconnects. Raises Refusal if the
-    server is stopped.
+    """Wait for a command's outcome and return the answer. The command is cancelled if the loop does not start it in
+    time or the client disconnects. Raises Refusal if the server is stopped.
     """
     answer = asyncio.wrap_future(command.answer)
     until_s = time.monotonic() + LOOP_ANSWERS_WITHIN_S
@@ -249,21 +230,9 @@ async def _outcome(command: Command, writer: StreamWriter) -> dict[str, Any]:
 
 
 def open_status_server(settings: ServiceSettings, *, clock: Clock, supervised: bool) -> StatusServer | None:
-    """Open the configured socket and start serving.
-
-    If the default socket is configured but its folder is not writable, the user's session socket is used instead. If no
-    socket can be opened, an unsupervised run logs a warning and continues without a server.
-
-    Args:
-        settings: Settings, which include the path to the socket.
-        supervised: True if the run was started by systemd.
-
-    Returns:
-        The server, or None if the run is unsupervised and cannot open a socket.
-
-    Raises:
-        SocketInUse: The run is supervised, and another phasestack process is using the socket.
-        InputError: The run is supervised, and the socket cannot be created.
+    """Open the configured socket and start serving. If the default socket is configured but its folder is
+    not writable, the user's session socket is used instead. If no socket can be opened, a run that systemd did not
+    start logs a warning and continues without one; otherwise, raises SocketInUse or InputError.
     """
     path = Path(settings.socket)
     own = user_socket()

@@ -12,10 +12,9 @@ from runtime.support.background import STOPS_WITHIN_S, ends_by
 
 
 class Signals:
-    """Context manager that sets flags on SIGTERM and SIGINT (stop) and on SIGHUP (reload).
-
-    If a stop has already been requested, SIGINT raises KeyboardInterrupt. For use on the main thread. The previous
-    handlers are restored on exit.
+    """Context manager, on the main thread, that sets flags on SIGTERM and SIGINT (stop) and SIGHUP
+    (reload). If a stop has already been requested, SIGINT raises KeyboardInterrupt. The previous handlers are restored
+    on exit.
     """
 
     def __init__(self) -> None:

@@ -28,12 +28,7 @@ class SocketInUse(TransientError):
 
 
 def listening_socket(path: Path) -> socket.socket:
-    """Create a socket that listens on `path`.
-
-    Raises:
-        SocketInUse: Another phasestack process is using the socket.
-        InputError: The socket cannot be created.
-    """
+    """Create a socket that listens on `path`. Raises SocketInUse or InputError."""
     made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -63,10 +58,7 @@ def listening_socket(path: Path) -> socket.socket:
 
 @contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Lock a folder, so that no two daemons replace a dead socket at the same time.
-
-    If the lock is not available within `LOCKED_WITHIN_S`, log a warning and continue without it.
-    """
+    """Lock a folder, so that no two daemons replace a dead socket at the same time, or warn after `LOCKED_WITHIN_S`."""
     opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         until_s = time.monotonic() + LOCKED_WITHIN_S
@@ -83,12 +75,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _remove_dead(path: Path) -> None:
-    """Remove a dead daemon's socket.
-
-    Raises:
-        SocketInUse: A daemon is listening on the socket.
-        InputError: The file is not a socket.
-    """
+    """Remove a dead daemon's socket. Raises SocketInUse if it is alive, InputError if the file is no socket."""
     if not os.path.lexists(path):
         return
     if not stat.S_ISSOCK(path.lstat().st_mode):

@@ -69,16 +69,7 @@ class RunningSolver:
     """`SolverParts` for a run."""
 
     def __init__(self, setup: SolverSetup, *, context: Any = None, slots: LayerSlots | None = None) -> None:
-        """Load the content and the model. If this fails, everything that was opened is closed.
-
-        Args:
-            setup: What to load.
-            context: GL context to share with the panels. None creates a new context.
-            slots: Memory shared with the presenter's process.
-
-        Raises:
-            FatalError: The content or the model cannot be used.
-        """
+        """Load the content and the model, for a new or a shared GL context. Raises FatalError, with all closed."""
         settings, stack = setup.settings, setup.stack
         if setup.program_addresses:
             import_module("runtime.content.program_server").reopen_at(setup.program_addresses)

@@ -140,9 +140,8 @@ def about(run: Run) -> dict[str, Any]:
 
 
 def library_scenes(settings: ContentSettings) -> tuple[str, ...]:
-    """List the paths of scenes in the library folder, at most `LIBRARY_MOST` of them.
-
-    A name that is not printable UTF-8 is skipped, because it cannot be used in settings.
+    """List at most `LIBRARY_MOST` paths of scenes in the library folder, without those that are not
+    UTF-8.
     """
     if not settings.library:
         return ()
@@ -175,11 +174,9 @@ JPEG_QUALITY = 80
 
 
 def pictures_of(refresh: Refresh, stack: PanelStack, *, fov_deg: float) -> dict[str, bytes]:
-    """Return thumbnails of a refresh as JPEG files, keyed by name.
-
-    The layers are named `layer-0` (the rear panel), `layer-1` and so on. Each eye's view, `seen-left` and `seen-right`,
-    is computed from reduced layers at the eye position that was solved for, because an exact view would take longer
-    than a refresh.
+    """Return thumbnails of a refresh as JPEG files, keyed by name. The layers are named `layer-0` (the
+    rear panel), `layer-1` and so on. Each eye's view, `seen-left` and `seen-right`, is computed from reduced layers at
+    the eye position that was solved for, because an exact view would take longer than a refresh.
     """
     frame, account = refresh.frame, refresh.account
     is_flat = frame.solved is None or (frame.flat is not None and frame.flatness > 0.5)

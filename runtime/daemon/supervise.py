@@ -34,10 +34,9 @@ PANEL_RETRY_S = 1.0  # interval between attempts to find a missing panel
 
 
 class Daemon(Host):
-    """Handles signals and commands, and publishes the status, between refreshes.
-
-    All methods must be called on the presenter's thread. The status server's thread calls only the latest published
-    snapshot and the functions in the server's `lookups`, and these read only frozen values and thread-safe counters.
+    """Handles signals and commands, and publishes the status, between refreshes. All methods must be
+    called on the presenter's thread. The status server's thread calls only the latest published snapshot and the
+    functions in the server's `lookups`, and these read only frozen values and thread-safe counters.
     """
 
     def __init__(
@@ -50,16 +49,7 @@ class Daemon(Host):
         recorder: Recorder | None = None,
         options: RunOptions | None = None,
     ) -> None:
-        """Create a supervisor for one run.
-
-        Args:
-            read_settings: Function that reads the configuration. Called on the loading thread. May raise InputError.
-            signals: Flags set by signals.
-            notifier: Sends messages to systemd.
-            server: Status server, or None for no status socket.
-            recorder: Black box, or None for no black box.
-            options: The run's options.
-        """
+        """Create a supervisor for one run; `read_settings`, on the loading thread, may raise InputError."""
         self._until = (options or RunOptions()).until
         self._link = (options or RunOptions()).browser
         self._read_settings = read_settings
@@ -106,10 +96,7 @@ class Daemon(Host):
             self._server.lookups |= {"log": self.recorder.look_at_log} if self.recorder is not None else {}
 
     def wait_for_panel(self, why: str) -> bool:
-        """Report a missing panel, and wait a second before the next attempt.
-
-        Without systemd or after a stop signal, returns False, which ends startup.
-        """
+        """Report a missing panel, and wait a second. Returns False without systemd or after a stop signal."""
         if not self._notifier.supervised or self._signals.stop:
             return False
         if why != self._waits_for:
@@ -123,10 +110,7 @@ class Daemon(Host):
         return not self._signals.stop
 
     def starting(self, doing: str) -> bool:
-        """Report the current startup step and ask systemd for more time.
-
-        After a stop signal, returns False.
-        """
+        """Report the startup step and ask systemd for more time. Returns False after a stop signal."""
         self._notifier.starting()
         self._notifier.status(f"starting ({doing})")
         if self._server is not None:
@@ -183,15 +167,8 @@ def _news(loading: str | None, refused: str, recorder: Recorder | None) -> dict[
 
 @retry_advised()
 def run_daemon(read_settings: Callable[[], Settings], options: RunOptions) -> dict[str, Any]:
-    """Run the daemon until it stops, and return its summary.
-
-    Args:
-        read_settings: Function that reads the configuration. Called at startup and on each reload.
-        options: The run's options.
-
-    Raises:
-        FatalError: The configuration or another file cannot be used.
-        TransientError: The run failed, but starting it again may succeed.
+    """Run the daemon until it stops, and return its summary. Raises FatalError or TransientError.
+    `read_settings` is called at startup and on each reload.
     """
     keep_freed_memory()  # before any thread is started
     settings = read_settings()

@@ -85,10 +85,7 @@ class BrowserEyes(Sensor):
 
 
 class BrowserCamera(Sensor):
-    """Driver that delivers camera frames sent by a web page.
-
-    The camera does not measure depth, so the viewer's distance is estimated from the eye separation.
-    """
+    """Driver of a web page's camera frames. The distance is estimated from the eye separation."""
 
     name = "browser"
     capabilities = Capabilities(colour=True)

@@ -41,13 +41,8 @@ class LiveSamples(Samples):
         self._skipped = 0
 
     def start(self, go_on: Callable[[], bool] = lambda: True) -> None:
-        """Have the sensor opened and polled, and wait a moment for it.
-
-        Args:
-            go_on: Function polled while the driver is being created. If it returns False, waiting ends.
-
-        Raises:
-            PhasestackError: The driver cannot be created.
+        """Have the sensor opened and polled, and wait a moment for it, unless `go_on` returns False. Raises
+        PhasestackError if the driver cannot be created.
         """
         self._begin(go_on)
         until_s = time.monotonic() + OPENS_WITHIN_S

@@ -43,7 +43,6 @@ class _Picture(NamedTuple):
 
 class OpenNI2Driver(Sensor):
     """Driver for OpenNI2 cameras that delivers colour frames as well as depth frames in millimetres.
-
     Depth is registered to colour if the camera supports it. All calls into the library run on a `_PersistentThread`,
     which outlives the calling thread.
     """
@@ -52,13 +51,7 @@ class OpenNI2Driver(Sensor):
     capabilities = Capabilities(colour=True, depth=True)
 
     def __init__(self, settings: SensorSettings, clock: Clock) -> None:
-        """Store the settings.
-
-        Args:
-            settings: Sensor settings. `source` is a serial number, a device URI or a `.oni` file. If it is empty or
-                `demo`, the only connected camera is used.
-            clock: The run's clock. Capture times are based on it.
-        """
+        """Store the settings. `source` is a serial number, a device URI, a `.oni` file, or the only camera."""
         self._settings, self._clock = settings, clock
         self._thread: _PersistentThread | None = None  # None if not open
         self._openni: Any = None
@@ -143,10 +136,7 @@ class OpenNI2Driver(Sensor):
         self._times, self._newest, self._index = DeviceClock(), {}, 0
 
     def _read_intrinsics(self, stream: Any) -> Intrinsics | None:
-        """Return intrinsics for a centred camera with the reported or the configured field of view.
-
-        Returns None if the field of view is neither reported nor configured.
-        """
+        """Return intrinsics for a centred camera with the reported or configured field of view, or None."""
         try:  # recordings claim to support the property but fail to return it
             fov_x, fov_y = stream.get_horizontal_fov(), stream.get_vertical_fov()
         except Exception:
@@ -274,10 +264,7 @@ def _text(error: Exception) -> str:
 
 
 def _pixels(frame: Any) -> U8 | U16:
-    """Copy a depth frame as (h, w) millimetres, or a colour frame as (h, w, 3) RGB.
-
-    Raises ValueError if the pixel format is not supported or the frame contains too few bytes.
-    """
+    """Copy a frame as (h, w) millimetres or (h, w, 3) RGB. Raises ValueError for other formats or too few bytes."""
     pixel_format, height, width = frame.videoMode.pixelFormat.value, frame.height, frame.width
     data = np.frombuffer(frame.get_buffer_as_uint8(), np.uint8)
     kinds = {DEPTH_1_MM: (2, 1), DEPTH_100_UM: (2, 1), RGB888: (1, 3), GRAY8: (1, 1)}

@@ -34,14 +34,7 @@ _loaded = False
 
 
 def find_library(folder: str = "") -> tuple[Path, Path]:
-    """Return the paths of the library and of its driver folder.
-
-    Args:
-        folder: Folder to search. If empty, search the folders in `LIBRARY_FOLDERS`.
-
-    Raises:
-        MissingPart: No searched folder contains both the library and its drivers.
-    """
+    """Return the library and its driver folder in a folder, or in `LIBRARY_FOLDERS`. Raises MissingPart."""
     for place in (folder,) if folder else LIBRARY_FOLDERS:
         drivers = Path(place) / "OpenNI2" / "Drivers"
         for library in sorted(Path(place).glob("libOpenNI2.so*")):
@@ -51,14 +44,8 @@ def find_library(folder: str = "") -> tuple[Path, Path]:
 
 
 def load(folder: str = "") -> Any:
-    """Load the library and return the module `openni.openni2`.
-
-    Args:
-        folder: Folder that contains the library. If empty, search the folders in `LIBRARY_FOLDERS`.
-
-    Raises:
-        MissingPart: The package `openni` or the library is missing.
-        SensorLost: The library cannot be started.
+    """Load the library, from `folder` or `LIBRARY_FOLDERS`, and return the module `openni.openni2`.
+    Raises MissingPart without the package or the library, and SensorLost if it cannot be started.
     """
     global _loaded
     try:

@@ -86,14 +86,8 @@ class Polling:
         *,
         keep_images: bool = False,
     ) -> None:
-        """Store the arguments.
-
-        Args:
-            make_driver: Function that creates a driver without opening it.
-            settings: Sensor settings, including the timeout for a read.
-            make_finder: Function that creates the eye finder, for drivers that do not find eyes themselves.
-            recipient: Where the samples go.
-            keep_images: Keep the pictures in samples after the eyes have been found.
+        """Store the arguments. `make_driver` does not open the device; `make_finder` is for drivers without eyes. With
+        `keep_images`, samples keep their pictures.
         """
         self._make, self._settings, self._clock = make_driver, settings, clock
         self._make_finder, self._recipient, self._keep_images = make_finder, recipient, keep_images
@@ -107,11 +101,8 @@ class Polling:
         self._untimely = ""  # description of the latest implausible capture time
 
     def run(self, *, serial: str = "", was_well: bool = False) -> None:
-        """Poll the sensor.
-
-        Args:
-            serial: The only device to open; "" for any.
-            was_well: True if the sensor has delivered valid samples before.
+        """Poll the sensor, only the device with this serial number if given. `was_well`: it has delivered
+        before.
         """
         self._was_well, self._serial = was_well, serial
         wait_s = REOPEN_AFTER_S
@@ -167,12 +158,9 @@ class Polling:
         self._skipped += driver.skipped
 
     def _receive(self, driver: Sensor) -> None:
-        """Read and send samples until the recipient ends it.
-
-        Raises:
-            SensorLost: The device has failed, no valid samples have arrived for too long, or the data no longer change.
-            FatalError: The first capture times are not on the run's clock.
-            EndOfRecording: The recording has ended.
+        """Read and send samples until the recipient ends it. Raises SensorLost if the device has failed, valid samples
+        are late, or the data no longer change, FatalError if the first capture times are not on the run's clock, and
+        EndOfRecording.
         """
         timeout_s = self._settings.timeout_s
         timeouts, well_ns, is_first = 0, self._clock.now_ns(), True
@@ -215,10 +203,7 @@ class Polling:
         raise _Over
 
     def _timely(self, frames: list[SensorFrame], now_ns: int) -> list[SensorFrame]:
-        """Return the frames whose capture times are plausible.
-
-        Raises FatalError if a capture time is implausible before any valid sample has arrived.
-        """
+        """Return the frames with plausible capture times. Raises FatalError if the very first are implausible."""
         timely = [frame for frame in frames if -AHEAD_NS <= now_ns - frame.capture_ns <= BEHIND_NS]
         if len(timely) < len(frames):
             ahead_s = (frames[-1].capture_ns - now_ns) / NS_PER_S
@@ -231,10 +216,8 @@ class Polling:
         return timely
 
     def _check_changing(self, frame: SensorFrame, now_ns: int) -> None:
-        """Check that the sensor's data keep changing.
-
-        Missing eye points, and depth pictures without any measurements, are not faults. Raises SensorLost if pictures
-        or eye points have stayed identical for more than `FROZEN_NS`.
+        """Check that the sensor's data keep changing, apart from missing eye points and empty depth. Raises SensorLost
+        if pictures or eye points have stayed identical for more than `FROZEN_NS`.
         """
         compared = {
             "picture has": None if frame.colour is None else frame.colour[COMPARED, COMPARED],

@@ -30,22 +30,13 @@ log = logging.getLogger(__name__)
 
 
 class RealSenseDriver(Sensor):
-    """Driver for RealSense cameras that delivers colour, depth in millimetres, and intrinsics.
-
-    The SDK aligns depth to colour.
-    """
+    """Driver for RealSense cameras: colour, depth in millimetres aligned to it, and intrinsics."""
 
     name = "realsense"
     capabilities = Capabilities(colour=True, depth=True)
 
     def __init__(self, settings: SensorSettings, clock: Clock) -> None:
-        """Import the SDK and store the settings.
-
-        Args:
-            settings: Sensor settings. `source` is a serial number, or a recording with a suffix in `FILES`. If it is
-                empty or `demo`, the only connected camera is used.
-            clock: The run's clock. Capture times are based on it.
-        """
+        """Import the SDK and store the settings. `source` is a serial number, one of `FILES`, or the only camera."""
         import pyrealsense2
 
         self._rs, self._settings, self._clock = pyrealsense2, settings, clock
@@ -83,10 +74,7 @@ class RealSenseDriver(Sensor):
         self._times, self._number = DeviceClock(), -1
 
     def _serial_to_open(self) -> str:
-        """Return the configured camera's serial number or, if none is configured, the only camera's.
-
-        Raises SensorLost if no connected camera matches or if several cameras match.
-        """
+        """Return the configured or only camera's serial number. Raises SensorLost if none or several match."""
         source = self._settings.source
         configured = self.serial or ("" if source in ("", "demo", "any") else source)
         info = self._rs.camera_info.serial_number
@@ -120,12 +108,8 @@ class RealSenseDriver(Sensor):
             raise SensorLost(f"RealSense: {error}") from None
 
     def _next(self, deadline_ns: int) -> Any:
-        """Wait for frames with an unread depth picture and return them.
-
-        Raises:
-            SensorTimeout: No new frames arrived before the deadline.
-            EndOfRecording: The recording has ended.
-            RuntimeError: The SDK reports an error.
+        """Wait for frames with an unread depth picture and return them. Raises SensorTimeout at the deadline,
+        EndOfRecording, and RuntimeError if the SDK reports an error.
         """
         while True:
             remaining_ms = max(1, (deadline_ns - self._clock.now_ns()) // NS_PER_MS)
@@ -142,10 +126,7 @@ class RealSenseDriver(Sensor):
         return self._playback is not None and not self._settings.loop and self._playback.current_status() != playing
 
     def _is_new(self, frames: Any) -> bool:
-        """Return True if frames contain a colour picture and a new depth picture.
-
-        The SDK may deliver the same depth picture with several colour pictures.
-        """
+        """Return True for a colour picture with new depth, which the SDK may deliver with several colour pictures."""
         depth = frames.get_depth_frame()
         if not depth or not frames.get_color_frame() or depth.get_frame_number() == self._number:
             return False
@@ -164,9 +145,7 @@ class RealSenseDriver(Sensor):
         )
 
     def _capture_ns(self, frame: Any) -> int:
-        """Return a depth picture's capture time on the run's clock.
-
-        The time is based on the SDK's timestamp on the host's clock or, if there is no plausible one, on the device's
+        """Return a depth picture's capture time on the run's clock, by the SDK's timestamp on the host's or device's
         clock.
         """
         now_ns, stamp_ns = self._clock.now_ns(), round(frame.get_timestamp() * NS_PER_MS)
@@ -204,8 +183,5 @@ def _millimetres(frame: Any) -> U16:
 
 
 def _intrinsics(camera: Any) -> Intrinsics:
-    """Convert intrinsics from the SDK.
-
-    Pixel centres have integer coordinates in the SDK and half-integer coordinates in `Intrinsics`.
-    """
+    """Convert intrinsics from the SDK, where pixel centres have integer coordinates."""
     return Intrinsics(camera.width, camera.height, camera.fx, camera.fy, camera.ppx + 0.5, camera.ppy + 0.5)

@@ -1,7 +1,4 @@
-"""Write and read recordings as MCAP files.
-
-Files consist of small chunks, so every complete sample remains readable after a crash.
-"""
+"""Recordings as MCAP files of small chunks, so that complete samples remain readable after a crash."""
 
 from __future__ import annotations
 
@@ -63,13 +60,8 @@ class RecordingWriter:
         max_s: float = MAX_S,
         on_first: Callable[[], object] = lambda: None,
     ) -> None:
-        """Write the beginning of the file.
-
-        Args:
-            file: Empty binary file. The caller closes it.
-            header: Recording properties. Colour is written only if `colour` is set, and depth if `depth` is.
-            max_s: Maximum time between the first and the last sample.
-            on_first: Function to call after the first sample has been written.
+        """Write the beginning of an empty binary file, which the caller closes. Colour and depth are written if the
+        header has them, for at most `max_s`. `on_first` is called after the first sample.
         """
         from mcap.writer import CompressionType, IndexType, Writer
 
@@ -96,10 +88,7 @@ class RecordingWriter:
         return self._channels[topic]
 
     def write(self, frame: SensorFrame) -> bool:
-        """Append a sample, writing its pictures before its eye points.
-
-        Returns False, and writes nothing, if the sample would exceed the maximum duration or size.
-        """
+        """Append a sample, pictures first. Returns False, and writes nothing, beyond the duration or size."""
         at, header = frame.capture_ns, self._header
         messages: list[tuple[str, bytes]] = []
         has_images = header.colour or header.depth
@@ -138,16 +127,8 @@ class RecordingWriter:
 @contextmanager
 def recording_to(path: Path, header: RecordingHeader, *, max_s: float = MAX_S) -> Iterator[RecordingWriter]:
     """Open a writer for a new recording that replaces any older file once the first sample is written.
-
     After a crash, the file is readable up to the last complete sample. A recording with pictures can be read only by
-    the file's owner.
-
-    Args:
-        header: Recording properties.
-        max_s: Maximum time between the first and the last sample.
-
-    Raises:
-        InputError: The file cannot be written, or another process is writing it.
+    the file's owner. Raises InputError if the file cannot be written, or another process is writing it.
     """
     part, file = path.with_name(f".{path.name}.part"), None
     try:
@@ -193,10 +174,7 @@ class Recording:
     """
 
     def __init__(self, path: Path) -> None:
-        """Read the header and the first sample.
-
-        Raises InputError if the file cannot be read, is not a recording or contains no complete samples.
-        """
+        """Read the header and the first sample. Raises InputError if the file has none or cannot be read."""
         self.path, self.is_whole = path, True
         self._written_by = ("", "")  # profile and library in the MCAP file's header
         self.header = self._read_header()
@@ -210,10 +188,7 @@ class Recording:
         return untrusted_input.open_regular(self.path, most_bytes=LIMITS.file_bytes)
 
     def _read_header(self) -> RecordingHeader:
-        """Return the header from the metadata record, which repair tools move to the file's end.
-
-        Raises InputError if the file has no phasestack metadata record, or if the record is not supported.
-        """
+        """Return the header from the metadata record, which repair tools move to the file's end. Raises InputError."""
         foreign = ""
         for topic, record in self._records():
             if topic and topic not in fmt.SCHEMAS:
@@ -262,11 +237,7 @@ class Recording:
             self.is_whole = False
 
     def samples(self) -> Iterator[SensorFrame]:
-        """Yield all complete samples in file order.
-
-        A sample is complete once its eye points have been read. Raises InputError if the file cannot be read or if a
-        message is malformed.
-        """
+        """Yield all samples whose eye points have been read, in file order. Raises InputError."""
         parts: dict[str, Any] = {}
         intrinsics: Intrinsics | None = None
         for topic, message in self._records():
@@ -285,16 +256,9 @@ class Recording:
 
 
 def _mcap_records(file: IO[bytes], *, source: Path, max_bytes: int) -> Iterator[Any]:
-    """Yield all records up to the footer, including the records inside chunks.
-
-    If a chunk is cut off by the end of the file, its complete records are yielded before the exception is raised.
-
-    Args:
-        max_bytes: Maximum size of a record, and of a chunk after decompression.
-
-    Raises:
-        InputError: A chunk exceeds `max_bytes` after decompression.
-        Exception: The file is damaged. The exception is a ValueError, or one raised by mcap or by a decompressor.
+    """Yield all records up to the footer, including those inside chunks, of at most `max_bytes` each. If a chunk is cut
+    off by the end of the file, its complete records are yielded before the exception is raised: InputError beyond
+    `max_bytes`, or for damage ValueError or one of mcap's or a decompressor's.
     """
     from mcap.records import Chunk
     from mcap.stream_reader import StreamReader, breakup_chunk
@@ -325,10 +289,7 @@ def _mcap_records(file: IO[bytes], *, source: Path, max_bytes: int) -> Iterator[
 
 
 def _indexed_chunks(file: IO[bytes], *, max_bytes: int) -> set[int]:
-    """Return the byte offsets of the chunks listed in the file's summary.
-
-    Returns an empty set if the file has no readable summary.
-    """
+    """Return the byte offsets of the chunks listed in the file's summary, none if it is not readable."""
     from mcap.reader import FOOTER_SIZE
     from mcap.records import ChunkIndex
     from mcap.stream_reader import StreamReader
@@ -346,10 +307,7 @@ def _indexed_chunks(file: IO[bytes], *, max_bytes: int) -> set[int]:
 
 
 def _cut_off_chunk(data: bytes) -> bytes:
-    """Return the complete records, decompressed, of a chunk cut off by the end of the file.
-
-    Returns no bytes if the data do not begin with a chunk, or if the chunk is not cut off.
-    """
+    """Return the complete records, decompressed, of a chunk cut off by the end of the file, or no bytes."""
     if data[:1] != CHUNK or RECORD.unpack_from(data.ljust(RECORD.size, b"\0"))[1] <= len(data) - RECORD.size:
         return b""
     name = CHUNK_HEAD.unpack_from(data.ljust(CHUNK_HEAD.size, b"\0"))[-1]
@@ -365,15 +323,7 @@ def _cut_off_chunk(data: bytes) -> bytes:
 
 
 def _unpacked(chunk: Any, *, source: Path, max_bytes: int) -> bytes:
-    """Return a chunk's decompressed records as bytes.
-
-    Args:
-        max_bytes: Maximum size after decompression.
-
-    Raises:
-        InputError: The chunk exceeds `max_bytes` after decompression.
-        ValueError: After decompression, the chunk does not have the size it declares.
-    """
+    """Return a chunk's decompressed records. Raises InputError beyond `max_bytes`, ValueError for a wrong size."""
     declared: int = chunk.uncompressed_size
     room = min(declared, max_bytes) + 1  # decompressors allocate up to their limit
     data = _expanded(chunk.compression, chunk.data, room=room)
@@ -386,12 +336,7 @@ def _unpacked(chunk: Any, *, source: Path, max_bytes: int) -> bytes:
 
 
 def _expanded(compression: str, data: bytes, *, room: int) -> bytes:
-    """Decompress data that may be truncated.
-
-    Args:
-        compression: Compression named in the chunk. Unless it is `lz4` or `zstd`, the data are returned unchanged.
-        room: Maximum number of decompressed bytes.
-    """
+    """Decompress `lz4` or `zstd` data, which may be truncated, to at most `room` bytes; return others unchanged."""
     if compression == "lz4":
         import lz4.frame
 

@@ -159,10 +159,7 @@ class RecordingHeader:
 
     @classmethod
     def from_metadata(cls, metadata: dict[str, str]) -> RecordingHeader:
-        """Create a header from the result of `metadata`.
-
-        Raises ValueError if the schema version is missing or not supported.
-        """
+        """Create a header from the result of `metadata`. Raises ValueError for another schema version."""
         version = metadata.get("schema_version", "missing")
         if version != str(SCHEMA_VERSION):
             raise ValueError(f"schema version {version} is not supported; this release reads version {SCHEMA_VERSION}")
@@ -171,10 +168,7 @@ class RecordingHeader:
 
 
 def _read(kind: type[M], data: bytes) -> M:
-    """Parse a JSON message.
-
-    Raises ValueError if the message is invalid. The error's text is one line that names the first invalid field.
-    """
+    """Parse a JSON message. Raises ValueError, one line that names the first invalid field."""
     try:
         return kind.model_validate_json(data)
     except ValidationError as error:
@@ -243,10 +237,7 @@ def _stamped(capture_ns: int, **values: Any) -> bytes:
 
 
 def colour_message(colour: U8, *, capture_ns: int) -> bytes:
-    """Encode an (h, w, 3) RGB picture as a JSON message that contains a JPEG.
-
-    Raises ValueError if OpenCV cannot encode the picture.
-    """
+    """Encode an (h, w, 3) RGB picture as a JSON message that contains a JPEG, or raise ValueError."""
     done, jpeg = cv2.imencode(".jpg", colour[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     if not done:
         raise ValueError("OpenCV could not encode a picture as JPEG")
@@ -254,9 +245,8 @@ def colour_message(colour: U8, *, capture_ns: int) -> bytes:
 
 
 def colour_from_message(data: bytes, *, max_pixels: int = 1 << 26) -> U8:
-    """Decode the result of `colour_message` to an (h, w, 3) RGB picture, with JPEG's losses.
-
-    Raises ValueError if the message is malformed, or if the picture is too large or cannot be decoded.
+    """Decode the result of `colour_message` to an (h, w, 3) RGB picture, with JPEG's losses. Raises
+    ValueError if the message is malformed, or if the picture is too large or cannot be decoded.
     """
     coded = base64.b64decode(_read(ColourImage, data).data)
     width, height = picture_size(coded)
@@ -276,10 +266,7 @@ def depth_message(depth_mm: U16, *, capture_ns: int) -> bytes:
 
 
 def depth_from_message(data: bytes) -> U16:
-    """Decode the result of `depth_message` to an (h, w) picture in millimetres, without loss.
-
-    Raises ValueError if the message is malformed or the amount of data does not match the picture's size.
-    """
+    """Decode `depth_message`, without loss, to (h, w) millimetres. Raises ValueError if it is malformed."""
     image = _read(DepthImage, data)
     raw = base64.b64decode(image.data)
     if len(raw) != 2 * image.width * image.height:
@@ -290,10 +277,7 @@ def depth_from_message(data: bytes) -> U16:
 
 
 def calibration_message(intrinsics: Intrinsics, *, capture_ns: int) -> bytes:
-    """Encode intrinsics as a JSON message that follows Foxglove's schema.
-
-    Pixel centres have integer coordinates in this schema, and half-integer coordinates in `Intrinsics`.
-    """
+    """Encode intrinsics as a JSON message by Foxglove's schema, where pixel centres are integers."""
     i = intrinsics
     matrix = [i.fx_px, 0.0, i.cx_px - 0.5, 0.0, i.fy_px, i.cy_px - 0.5, 0.0, 0.0, 1.0]
     projection = [*matrix[:3], 0.0, *matrix[3:6], 0.0, *matrix[6:], 0.0]
@@ -303,9 +287,8 @@ def calibration_message(intrinsics: Intrinsics, *, capture_ns: int) -> bytes:
 
 
 def intrinsics_from_message(data: bytes) -> Intrinsics:
-    """Decode the result of `calibration_message`.
-
-    Raises ValueError if the message is malformed or a focal length is not positive.
+    """Decode `calibration_message`. Raises ValueError if it is malformed or a focal length is not
+    positive.
     """
     camera = _read(Camera, data)
     k = camera.K

@@ -20,16 +20,8 @@ DRIVERS = {  # included in phasestack
 
 
 def open_sensor(settings: SensorSettings, clock: Clock, *, latency_ms: float = 0.0) -> Sensor:
-    """Create the configured driver without opening the device.
-
-    Args:
-        settings: Sensor settings. `driver` is a name in `DRIVERS`, or `module:Class` for a custom driver.
-        clock: The run's clock. Capture times are based on it.
-        latency_ms: Replayed samples' delay from capture to arrival. Other drivers ignore it.
-
-    Raises:
-        InputError: The name is unknown, or the driver refuses its options.
-        MissingPart: The driver's SDK is not installed.
+    """Create the configured driver, of `DRIVERS` or `module:Class`, without opening the device.
+    `latency_ms` is replayed samples' delay. Raises InputError for the name or the options, or MissingPart.
     """
     name = settings.driver
     if is_plugin(name):

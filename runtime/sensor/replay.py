@@ -24,26 +24,15 @@ def demo_recording_path() -> Path:
 
 
 class ReplayDriver(SteppedSensor):
-    """Driver that plays back a recording at its original rate, including gaps, starting at `open`.
-
-    Each sample arrives at its capture time plus the latency. If a sample is not later than its predecessor, it is
-    skipped. Only the first skipped sample is logged.
+    """Driver that plays back a recording at its original rate, including gaps, starting at `open`. Each
+    sample arrives at its capture time plus the latency. If a sample is not later than its predecessor, it is skipped.
+    Only the first skipped sample is logged.
     """
 
     name = "replay"
 
     def __init__(self, source: str, clock: Clock, *, loop: bool = False, latency_ms: float = 0.0) -> None:
-        """Store the settings.
-
-        Args:
-            source: Path of a recording, or `demo` for the demo recording.
-            clock: The run's clock. Capture times are shifted to it.
-            loop: Start again at the end of the recording.
-            latency_ms: Each sample's delay from capture to arrival.
-
-        Raises:
-            InputError: The path is empty.
-        """
+        """Store the path of a recording, or `demo`, to repeat if `loop`. Raises InputError if it is empty."""
         if not source:
             raise InputError("sensor", "source", "is empty; name a recording, or `demo`")
         self.path, self._loop = demo_recording_path() if source == "demo" else Path(source), loop
@@ -81,9 +70,8 @@ class ReplayDriver(SteppedSensor):
             yield frame
 
     def _shifted(self, recording: Recording) -> Iterator[SensorFrame]:
-        """Yield samples with capture times on the run's clock.
-
-        When looping, the first sample follows the last one after the same interval as between the last two samples.
+        """Yield samples with capture times on the run's clock. When looping, the first sample follows the last one
+        after the same interval as between the last two samples.
         """
         last_ns = interval_ns = sequence_shift = last_sequence = shift_ns = 0
         is_first_round = True

@@ -34,12 +34,7 @@ class Samples(ABC):
 
     @abstractmethod
     def arrived(self, now_ns: int) -> list[SensorFrame]:
-        """Return the samples that have arrived since the last call, oldest first.
-
-        Raises:
-            EndOfRecording: All of the recording's samples have been returned.
-            FatalError: The sensor has failed permanently.
-        """
+        """Return the samples since the last call, oldest first. Raises EndOfRecording or FatalError."""
 
     def fault(self) -> str:
         """Return the reason why the sensor is not working, or an empty string."""
@@ -50,10 +45,7 @@ class Samples(ABC):
         return []
 
     def recorded_ahead(self) -> list[SensorFrame]:
-        """Return the recorded samples that follow shortly after the last refresh, for evaluation.
-
-        A live sensor returns an empty list.
-        """
+        """Return the recorded samples shortly after the last refresh, for evaluation; none of a live sensor."""
         return []
 
     @abstractmethod
@@ -75,16 +67,10 @@ def searched(frame: SensorFrame, finder: Finder | None, *, keep_images: bool = F
 
 
 class RecordedSamples(Samples):
-    """A recording played back against a simulated clock.
-
-    Each sample arrives at its capture time plus the latency.
-    """
+    """A recording played back against a simulated clock: samples arrive after capture and latency."""
 
     def __init__(self, driver: Sensor) -> None:
-        """Open the driver.
-
-        Raises InputError if the driver cannot deliver samples without waiting, or if the recording cannot be read.
-        """
+        """Open the driver. Raises InputError if it must wait for samples, or cannot read the recording."""
         if not isinstance(driver, SteppedSensor):
             raise InputError("run", "--max-speed", f"requires a recording, not the sensor {driver.name}")
         self._driver = driver

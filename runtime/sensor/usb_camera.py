@@ -29,26 +29,16 @@ STREAMS = ("rtsp", "rtsps", "http", "https")  # FFmpeg's other protocols may ope
 
 
 class UsbCameraDriver(Sensor):
-    """Driver that delivers a camera's newest picture.
-
-    A webcam picture's capture time is the kernel's timestamp for the end of the exposure. Other pictures are given
-    their arrival time.
+    """Driver that delivers a camera's newest picture. A webcam picture's capture time is the kernel's
+    timestamp for the end of the exposure. Other pictures get their arrival time.
     """
 
     name = "usb-camera"
     capabilities = Capabilities(colour=True)
 
     def __init__(self, settings: SensorSettings, clock: Clock) -> None:
-        """Store the settings.
-
-        Args:
-            settings: Sensor settings. `source` is a video device's number or path, a file, or a URL with a protocol in
-                `STREAMS`. If it is empty or `demo`, the first camera is used.
-            clock: The run's clock. Capture times are based on it.
-
-        Raises:
-            InputError: The URL has another protocol, or the field of view is not configured. Webcams do not report
-                their field of view.
+        """Store the settings. `source` is a video device's number or path, a file, a URL, or the first camera. Raises
+        InputError for a protocol that is not in `STREAMS`, or without a field of view, which webcams do not report.
         """
         if not settings.fov_deg:
             raise InputError("sensor", "fov_deg", "must be set to the camera's horizontal field of view in degrees")

@@ -84,14 +84,8 @@ def _described(device: Any, known: KnownDevice) -> UsbDevice:
 
 
 def find_devices(backend: Any = None) -> list[UsbDevice]:
-    """Return all connected USB depth cameras of known models, ordered by bus and address.
-
-    Args:
-        backend: The pyusb backend. None selects the default one.
-
-    Raises:
-        MissingPart: pyusb or libusb is not installed.
-        SensorLost: The USB devices cannot be listed.
+    """Return all connected USB depth cameras of known models, by bus and address. Raises MissingPart
+    without pyusb or libusb, and SensorLost if devices cannot be listed.
     """
     try:
         import usb.core

@@ -43,15 +43,8 @@ def put_in_place(part: Path, path: Path) -> None:
 
 
 def write_bytes(path: Path, data: bytes, *, like: Path | None = None) -> None:
-    """Write a file atomically and create missing folders.
-
-    Args:
-        path: File to create or replace.
-        data: The file's content.
-        like: Existing file whose owner and mode are copied. By default, a replaced file's owner and mode are kept.
-
-    Raises:
-        InputError: The file cannot be written.
+    """Write a file atomically and create missing folders. Raises InputError if that fails. Owner and mode
+    are those of the file `like`, by default of the replaced file.
     """
     like = like or path
     try:
@@ -116,11 +109,7 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def png_bytes(image: U8) -> bytes:
-    """Encode an image as PNG. An alpha channel is dropped.
-
-    Args:
-        image: RGB or RGBA image, shape (h, w, 3 or 4), or grey image, shape (h, w).
-    """
+    """Encode an image (h, w), (h, w, 3) or (h, w, 4), whose alpha is dropped, as PNG."""
     import cv2
 
     bgr = image if image.ndim == 2 else np.ascontiguousarray(image[..., 2::-1])
@@ -142,7 +131,7 @@ def refuse_file(out: Path) -> None:
 
 
 class OutputFolder:
-    """Output folder whose new files appear all at once at the end, or not at all.
+    """Output folder whose new files appear all together at the end, or not at all.
 
     Use the class as a context manager, and write the files to `staging`. On success, all files are moved to `target`,
     replacing any files of the same names. If the block raises an exception, no new files remain. If a process is
@@ -185,11 +174,7 @@ class OutputFolder:
             raise InputError(self.target, "", f"cannot be written: {error.strerror}") from None
 
     def _put_in_place(self) -> None:
-        """Move all staged files to the target folder.
-
-        Raises InputError if a file cannot be moved. All destinations are checked for obstacles before the first file is
-        moved.
-        """
+        """Move all staged files to the target folder, after checking all destinations. Raises InputError."""
         files = sorted(path for path in self.staging.rglob("*") if path.is_file())
         places = {path: self.target / path.relative_to(self.staging) for path in files}
         for place in places.values():
@@ -214,10 +199,7 @@ class OutputFolder:
 
 
 def _sweep(target: Path) -> None:
-    """Remove killed processes' staging folders.
-
-    A live process holds a lock on its folder. Unlike checking process IDs, this also works across namespaces.
-    """
+    """Remove killed processes' staging folders: a live one holds a lock on its folder, also across namespaces."""
     for stale in target.glob(f"{STAGING}*"):
         with suppress(OSError):
             opened = os.open(stale, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
@@ -229,12 +211,7 @@ def _sweep(target: Path) -> None:
 
 
 def _check_free(place: Path, *, within: Path) -> None:
-    """Raise InputError if a folder exists where a file must go, or a file where a folder must go.
-
-    Args:
-        place: A file's final path.
-        within: Output folder that contains `place`. This folder is not checked.
-    """
+    """Raise InputError if a folder exists where a file must go, or a file where a folder must go, inside `within`."""
     for folder in place.parents:
         if folder == within:
             break
@@ -246,9 +223,8 @@ def _check_free(place: Path, *, within: Path) -> None:
 
 @contextmanager
 def held_back() -> Iterator[None]:
-    """Suppress anything that libraries write to stderr's file descriptor within the block.
-
-    If other threads are running, nothing is suppressed, because the descriptor belongs to the whole process.
+    """Suppress anything that libraries write to stderr's file descriptor, unless other threads are
+    running.
     """
     if threading.active_count() > 1:
         yield

@@ -1,7 +1,4 @@
-"""Send messages between two processes of one run.
-
-Large arrays are passed in shared memory, not through the socket.
-"""
+"""Messages between two processes of one run. Large arrays are passed in shared memory."""
 
 from __future__ import annotations
 
@@ -27,11 +24,8 @@ class ChannelClosed(Exception):
 
 
 class Channel:
-    """One end of a two-way channel.
-
-    Messages are any picklable values, and arrive whole, in order, or not at all.
-
-    Both processes are trusted, because a message is unpickled. Each end may be used by only one thread at a time.
+    """One end of a two-way channel of picklable values, which arrive whole, in order, or not at all. Both
+    processes are trusted, because a message is unpickled. Each end may be used by only one thread at a time.
     """
 
     def __init__(self, end: socket.socket) -> None:
@@ -54,13 +48,8 @@ class Channel:
         return self._socket.fileno()
 
     def send(self, message: Any, *, timeout_s: float = 0.0) -> bool:
-        """Send a message. Return False if the other process has too many messages unread.
-
-        Args:
-            timeout_s: How long to wait until there is room.
-
-        Raises:
-            ChannelClosed: The other process has ended.
+        """Send a message. Return False if the other process has too many unread for `timeout_s`. Raises
+        ChannelClosed if it has ended.
         """
         large: list[memoryview] = []
 
@@ -81,13 +70,8 @@ class Channel:
             os.close(memory)
 
     def receive(self, timeout_s: float = 0.0) -> list[Any]:
-        """Return all messages that have arrived, oldest first.
-
-        Args:
-            timeout_s: How long to wait for the first message.
-
-        Raises:
-            ChannelClosed: The other process has ended, and all of its messages have been returned.
+        """Return all messages that have arrived, oldest first, after waiting up to `timeout_s` for one.
+        Raises ChannelClosed once the other process has ended and its messages have been returned.
         """
         messages: list[Any] = []
         while True:
@@ -129,12 +113,7 @@ class Channel:
 
 
 def shared_memory(name: str, size: int) -> int:
-    """Return the file descriptor of new shared memory, all zeros.
-
-    Memory is used only for what is written.
-
-    Raises OSError if the system has none.
-    """
+    """Return the descriptor of new shared memory, zeros, used as it is written. Raises OSError."""
     memory = os.memfd_create(name, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
     os.ftruncate(memory, size)
     fcntl.fcntl(memory, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK)  # a process would be ended if its mapping shrank

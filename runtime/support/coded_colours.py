@@ -27,13 +27,8 @@ ROWS = 32  # rows converted together, which fit into a processor's cache
 
 
 def stated_profile(coded: bytes) -> bytes:
-    """Return the ICC profile for a picture's declared colours.
-
-    Args:
-        coded: Encoded picture. Its beginning is sufficient.
-
-    Returns:
-        The ICC profile, or empty bytes if the picture declares no colours, sRGB or unknown colours.
+    """Return the ICC profile of an encoded picture's declared colours, or empty bytes for sRGB or unknown
+    ones. The picture's beginning is sufficient.
     """
     found = NCLX.search(coded[:SEARCHED]) if coded[4:8] == b"ftyp" else None
     if found is None:

@@ -23,9 +23,8 @@ KEPT = 20  # maximum number of reports; a service that fails repeatedly must not
 
 
 def written(error: BaseException) -> str:
-    """Write an exception report to a file, and return a line for the user that names the file.
-
-    If no file can be written, the line says so. Never raises an exception.
+    """Write an exception report, and return a line for the user that names the file or its failure. Never
+    raises.
     """
     summary = one_line(f"{type(error).__name__}: {error}" if str(error) else type(error).__name__)
     if place := _user_code(error):
@@ -35,10 +34,7 @@ def written(error: BaseException) -> str:
 
 
 def _user_code(error: BaseException) -> str:
-    """Return the file and line of a user's class that raised an error, or an empty string if phasestack did.
-
-    Frames of installed packages and of Python are skipped.
-    """
+    """Return the file and line of a user's class that raised an error, or "" if phasestack or a package did."""
     root = Path(__file__).resolve().parents[2]
     own, installed = [root / name for name in ROOMS], [Path(sys.prefix), Path(sys.base_prefix)]
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
@@ -51,13 +47,8 @@ def _user_code(error: BaseException) -> str:
 
 
 def report_of(summary: str, trace: str) -> str:
-    """Write a report to a file, and return the part of a message that names the file.
-
-    If no file can be written, the message says so. Never raises an exception.
-
-    Args:
-        summary: What has happened, such as the end of another process. Empty if the trace says it.
-        trace: The stack, or the stacks of all threads.
+    """Write a report of stacks to a file, and return the part of a message that names it. Never raises.
+    `summary` says what has happened, such as the end of another process, unless the trace does.
     """
     from runtime.support.version import version
 

@@ -12,10 +12,7 @@ NOT_TO_RUN = frozenset({"all", "docs", "test"})  # extras that are never suggest
 
 
 def missing_extra(error: BaseException) -> MissingPart | None:
-    """Return an error that names the extra to install after an import has failed.
-
-    Returns None if the import failed for another reason, or if no extra contains the package.
-    """
+    """Return an error that names the extra to install after a failed import, or None for other reasons."""
     if not isinstance(error, ModuleNotFoundError) or not error.name:
         return None
     module = error.name.partition(".")[0]

@@ -17,10 +17,7 @@ def shown(record: Mapping[str, Any], *, as_json: bool) -> str:
 
 
 def lines_of(record: Mapping[str, Any]) -> Iterator[str]:
-    """Yield one line per field in a record. A list of objects gives one line per object.
-
-    Fields whose value is null, false or empty are skipped. Line breaks within values are replaced.
-    """
+    """Yield a line per field of a record, or per object of a list, unless null, false or empty."""
     for name, value in record.items():
         is_list = isinstance(value, list | tuple) and all(isinstance(item, dict) for item in value)
         for each in value if is_list else (value,):

@@ -64,22 +64,12 @@ class FilmHeader:
 
 
 class Film:
-    """A film file's frames and their times.
-
-    If the file has two streams of equal pictures, such as Fuji's 3D films, they are the left and right view. An audio
-    file's cover is a film of one frame.
+    """A film file's frames and their times. An audio file's cover is a film of one frame. Two streams of
+    equal pictures, such as Fuji's 3D films, are the left and right view.
     """
 
     def __init__(self, path: Path, *, times_ns: NDArray[np.int64] | None = None) -> None:
-        """Open a film.
-
-        Args:
-            path: Film file.
-            times_ns: The frames' times (n + 1,), if they are known.
-
-        Raises:
-            InputError: The path is not a regular file, or the file cannot be decoded.
-        """
+        """Open a film, with the times (n + 1,) of its frames if known. Raises InputError."""
         self.path = path
         self._container: Any = None
         self._start_ns = 0
@@ -142,9 +132,8 @@ class Film:
         return np.asarray(times_ns, np.int64)
 
     def pictures(self, since_ns: int = 0) -> Iterator[Picture]:
-        """Decode the pictures in order of time, from a given time or earlier. Damaged ones are left out.
-
-        Another iterator must not be in use.
+        """Decode the pictures in order of time, from a given time or earlier, without damaged ones. Another
+        iterator must not be in use.
         """
         if since_ns > 0:
             stream = self._streams[0]
@@ -256,12 +245,9 @@ class FilmWriter:
 
 
 def open_film(path: Path) -> av.container.InputContainer:
-    """Open a film's container.
-
+    """Open a film's container. Raises InputError if the path is not a regular file or is not a film.
     FFmpeg is restricted to local files and video containers. Otherwise, a playlist or script with a film's suffix, or a
     name that looks like a URL, could make FFmpeg open other files and network connections.
-
-    Raises InputError if the path is not a regular file or is not a film.
     """
     untrusted_input.open_regular(path).close()
     options = {"protocol_whitelist": "file", "format_whitelist": CONTAINERS}

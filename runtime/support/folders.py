@@ -8,10 +8,7 @@ from pathlib import Path
 
 
 def state_folder() -> Path:
-    """Return the systemd service's state folder or, if not run as a service, the user's.
-
-    If there is no home folder, returns a folder among the temporary files.
-    """
+    """Return the systemd service's or the user's state folder or, without a home folder, a temporary one."""
     if service := os.environ.get("STATE_DIRECTORY", ""):
         return Path(service.split(":")[0])
     xdg, home = os.environ.get("XDG_STATE_HOME", ""), os.environ.get("HOME", "")

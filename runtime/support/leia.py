@@ -19,13 +19,8 @@ JSON_BYTES_MAX = 65536
 
 
 def other_view(file: IO[bytes]) -> tuple[slice, bool] | None:
-    """Find the second JPEG in a Leia picture.
-
-    Args:
-        file: Open file. Its position changes.
-
-    Returns:
-        The second JPEG's byte range, and True if this JPEG is the left eye's picture. None for other files.
+    """Return the second JPEG's byte range in a Leia picture, and if it is the left eye's, or None for
+    others. The file's position changes.
     """
     size = file.seek(0, 2)
     if size < 6:

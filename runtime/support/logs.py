@@ -40,10 +40,7 @@ LINE_MAX = 4000  # maximum number of characters in a line
 
 
 class TextFormat(logging.Formatter):
-    """Formatter that starts each line with the time and level or, for journald, with a priority.
-
-    Journald adds the time itself.
-    """
+    """Formatter that starts each line with time and level or, for journald, only a priority."""
 
     def __init__(self, *, journald: bool) -> None:
         super().__init__()
@@ -60,10 +57,8 @@ class TextFormat(logging.Formatter):
 
 
 class RateLimit(logging.Filter):
-    """Filter that passes at most five identical messages within 30 s.
-
-    The next message that passes states how many were suppressed. Records with `extra={"always": True}`, such as changes
-    of state, always pass.
+    """Filter that passes at most five identical messages within 30 s. The next message that passes states
+    how many were suppressed. Records with `extra={"always": True}`, such as changes of state, always pass.
     """
 
     def __init__(self, clock: Clock) -> None:
@@ -91,10 +86,7 @@ class RateLimit(logging.Filter):
 
 
 class _Lines(logging.Handler):
-    """Handler that writes lines to a file descriptor.
-
-    A slow reader blocks the handler, so it is only used on the listener's thread.
-    """
+    """Handler that writes lines to a file descriptor, on the listener's thread, because a slow reader blocks it."""
 
     def __init__(self, descriptor: int) -> None:
         super().__init__()
@@ -146,12 +138,8 @@ class QueuedLines(QueueHandler):
 def configure(
     *, stream: TextIO | None = None, clock: Clock | None = None, environment: Mapping[str, str] = os.environ
 ) -> None:
-    """Set up logging, or replace an earlier setup.
-
-    Args:
-        stream: Stream for the log lines, by default stderr.
-        clock: Clock for the rate limit.
-        environment: Environment variables, used to detect a journald stream.
+    """Set up logging, again if need be, to a stream, by default stderr, or to journald. `clock` is for
+    the rate limit; `environment` tells whether the stream is journald's.
     """
     for old in logging.getLogger(ROOTS[0]).handlers[:]:
         if isinstance(old, QueuedLines):
@@ -167,9 +155,6 @@ def configure(
 
 
 def flush() -> None:
-    """Wait up to `CLOSE_S` seconds for the queued lines to be written.
-
-    Call this function before ending the process without clean-up.
-    """
+    """Wait up to `CLOSE_S` seconds for the queued lines to be written, before a process ends abruptly."""
     for handler in logging.getLogger(ROOTS[0]).handlers:
         handler.flush()

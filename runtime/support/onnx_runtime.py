@@ -9,10 +9,7 @@ from typing import Any
 
 @cache
 def onnxruntime() -> Any:
-    """Import and return onnxruntime with telemetry disabled.
-
-    Telemetry is disabled both by an environment variable and by a function call.
-    """
+    """Import onnxruntime with telemetry disabled, by environment variable and by function call."""
     os.environ["ORT_DISABLE_TELEMETRY"] = "1"
     import onnxruntime as ort
 

@@ -23,15 +23,8 @@ OPTION_OF = {("content", "scene"): "scene", ("model", "name"): "model"}  # optio
 
 
 def number(low: float, high: float, unit: str = "", *, help: str) -> Any:
-    """Return a typer option for numbers within a range.
-
-    For NaN and for numbers out of range, parsing raises an InputError that names the command and the option.
-
-    Args:
-        low: Smallest accepted number, finite.
-        high: Largest accepted number, finite.
-        unit: Unit for messages, such as `m`.
-        help: Help text, to which the range is appended.
+    """Return a typer option for finite numbers from `low` to `high`, a range that is added to the help.
+    Parsing other numbers raises an InputError that names the command and the option. `unit` is for messages.
     """
     return typer.Option(help=f"{help} ({low:g} to {high:g})", callback=_checked(low, high, unit))
 
@@ -43,11 +36,8 @@ def place(*, help: str) -> Any:
 
 @contextmanager
 def blame_option(command: str, **options: Any) -> Iterator[None]:
-    """Make any InputError raised in the block name the command-line option that set the faulty setting.
-
-    Args:
-        command: Command name.
-        options: Values of the options in OPTION_OF, keyed by name. None: the option was not given.
+    """Make any InputError raised in the block name the option that set the faulty setting. `options` are
+    the values of those in OPTION_OF, None if not given.
     """
     try:
         yield

@@ -38,20 +38,14 @@ DEEP = {"I;16": "<u2", "I;16L": "<u2", "I;16B": ">u2", "I;16N": "=u2"}  # Pillow
 
 
 def read_image(path: Path) -> U8:
-    """Read the first picture in a file as 8-bit sRGB, shape (h, w, 3), over white.
-
-    Raises InputError if the file cannot be read or decoded, or if the picture has too many pixels. The number of pixels
-    is checked before decoding.
+    """Read the first picture in a file as 8-bit sRGB (h, w, 3), over white. Raises InputError if the file
+    cannot be decoded, or has too many pixels, which is checked before decoding.
     """
     return read_views(path)[0]
 
 
 def read_views(path: Path, *, background: Colour = WHITE) -> list[U8]:
-    """Read the left and right eye's pictures from a stereo pair, or a single picture from any other file.
-
-    The pictures' format and the exceptions are the same as for `read_image`. `background` is the colour
-    behind transparent parts.
-    """
+    """Read a stereo pair's left and right picture, or a single picture, as `read_image` does."""
     data, header = read_coded(path)
     if header.warning:
         log.warning("%s: %s", path, header.warning)
@@ -62,10 +56,9 @@ def read_views(path: Path, *, background: Colour = WHITE) -> list[U8]:
 
 
 def read_animation(path: Path, *, background: Colour = WHITE) -> tuple[list[U8], list[float]]:
-    """Read the frames of an animated picture, and the duration of each frame in milliseconds.
-
-    If the frames' total pixel count exceeds the limit for a single picture, only the first frame is read and a
-    warning is logged. Raises InputError if the file cannot be read or decoded.
+    """Read the frames of an animated picture, and the duration of each in ms. Raises as `read_image`. If
+    the frames' total pixel count exceeds the limit for a single picture, only the first frame is read and a warning is
+    logged.
     """
     data, header = read_coded(path)
     with opened(data) as image:
@@ -80,10 +73,7 @@ def read_animation(path: Path, *, background: Colour = WHITE) -> tuple[list[U8],
 
 
 def _decoded(path: Path, data: bytes, frames: tuple[int, ...], background: Colour) -> Iterator[tuple[U8, float]]:
-    """Yield frames as 8-bit sRGB, each with its duration in milliseconds.
-
-    Raises InputError if a frame cannot be decoded or has too many pixels.
-    """
+    """Yield frames as 8-bit sRGB, each with its duration in ms. Raises InputError as `read_image`."""
     if is_cut_off(data):
         raise InputError(path, "", undecodable(data))
     try:
@@ -104,16 +94,8 @@ def _decoded(path: Path, data: bytes, frames: tuple[int, ...], background: Colou
 
 
 def rgb_of(image: Any, source: object, *, background: Colour = WHITE) -> U8:
-    """Convert a decoded Pillow image to 8-bit sRGB, shape (h, w, 3).
-
-    The conversion applies the image's EXIF orientation and colour profile.
-
-    Args:
-        image: Decoded Pillow image.
-        background: Colour behind transparent parts.
-
-    Raises:
-        InputError: The image has 32-bit values without a defined range.
+    """Convert a decoded Pillow image, by its orientation and colour profile, to 8-bit sRGB (h, w, 3).
+    Raises InputError if the image has 32-bit values without a defined range.
     """
     profile = image.info.get("icc_profile")
     image = _upright(image)
@@ -138,13 +120,7 @@ def rgb_of(image: Any, source: object, *, background: Colour = WHITE) -> U8:
 
 
 def composed(colour: U8, alpha: U8, behind: Any) -> U8:
-    """Compose a picture over a background, colour·a + behind·(1 - a), with rounding.
-
-    Args:
-        colour: Picture, shape (h, w, 3).
-        alpha: Opacity a times 255, shape (h, w, 1).
-        behind: Background colour in code values, shape (3,).
-    """
+    """Compose pictures (h, w, 3), rounded: colour·a + behind·(1 - a), with `alpha` (h, w, 1) = 255·a."""
     mixed = colour.astype(np.uint16) * alpha + behind.astype(np.uint16) * (255 - alpha.astype(np.uint16))  # < 65,026
     return np.asarray((mixed + 127) // 255, np.uint8)
 
@@ -166,13 +142,8 @@ def _eight_bits(image: Any) -> Any:
 
 
 def _to_srgb(profile: bytes, colours: str, source: object) -> Any:
-    """Return a function that converts images from a colour profile to sRGB.
-
-    Returns None if no conversion is needed, because the profile is broken or close to sRGB.
-
-    Args:
-        profile: ICC profile.
-        colours: Mode of the Pillow images to be converted: `L`, `RGB` or `CMYK`.
+    """Return a function that converts images (`L`, `RGB` or `CMYK`) from an ICC profile to sRGB. None if the profile is
+    broken or close to sRGB.
     """
     try:
         transform = ImageCms.buildTransform(

@@ -82,13 +82,9 @@ class Header:
 
 @contextmanager
 def opened(coded: bytes | IO[bytes]) -> Iterator[Any]:
-    """Open a picture with Pillow without decoding the pixels, and yield the Pillow image.
-
+    """Open an encoded picture with Pillow, without decoding the pixels, and yield the Pillow image.
     Pillow's limits and warnings are disabled while any picture is open, because the callers apply stricter limits. For
     invalid pictures, the class of the exception depends on the format.
-
-    Args:
-        coded: Encoded picture, as bytes or as an open file.
     """
     from PIL import Image
 
@@ -136,15 +132,8 @@ def _formats() -> tuple[str, ...]:
 
 
 def _header_of(path: Path, file: IO[bytes]) -> Header:
-    """Read a picture's header.
-
-    Args:
-        path: Picture file. A second picture of undefined type counts as an eye's view only if the suffix is .mpo.
-        file: The open file.
-
-    Raises:
-        InputError: The file is a camera's raw picture, the header cannot be decoded, or the picture has too many
-            pixels.
+    """Read a picture's header. A second picture of undefined type counts as a view only if the suffix is .mpo. Raises
+    InputError for a camera's raw picture, a header that cannot be decoded, or too many pixels.
     """
     if path.suffix.lower() in RAW:  # many raw files are TIFFs, and Pillow would show only their thumbnails
         raise InputError(path, "", "is {}, which is not supported; {}".format(*RAW_KIND))
@@ -172,16 +161,9 @@ def _beginning(file: IO[bytes], most_bytes: int) -> bytes:
 
 
 def _views(image: Any, *, is_named_so: bool) -> tuple[tuple[int, ...], str]:
-    """Find the frames that show the left and right eye's views.
-
-    A second picture counts as a view only if the file declares a stereo pair and both pictures have the same size.
-
-    Args:
-        image: Opened Pillow image.
-        is_named_so: Also accept an MPO whose second picture has an undefined type, because the file's suffix is .mpo.
-
-    Returns:
-        The indices of the left and right frames, or the index of a single frame, and a warning, which may be empty.
+    """Return the indices of the left and right frames, or of a single one, and a warning or "". A second picture counts
+    only if the file declares a stereo pair, or `is_named_so` (.mpo) and its type is undefined, and both have the same
+    size.
     """
     shown = (image.tell(),)
     if image.format == "HEIF":
@@ -206,12 +188,7 @@ def _views(image: Any, *, is_named_so: bool) -> tuple[tuple[int, ...], str]:
 
 
 def _leia_view(file: IO[bytes], size: tuple[int, int]) -> tuple[slice, bool] | None:
-    """Return the result of `other_view`, or None if the second view is not a picture of the given size.
-
-    Args:
-        file: The open picture file.
-        size: The first view's width and height.
-    """
+    """Return the result of `other_view`, or None if the second view does not have the first one's (width, height)."""
     if found := other_view(file):
         file.seek(found[0].start)
         with suppress(ValueError):
@@ -221,10 +198,7 @@ def _leia_view(file: IO[bytes], size: tuple[int, int]) -> tuple[slice, bool] | N
 
 
 def _jps_layout(image: Any) -> str:
-    """Return the layout declared by a JPEG's stereo header (JPS), or an empty string.
-
-    The result is in the syntax of the setting `content.layout`.
-    """
+    """Return the layout, as in `content.layout`, declared by a JPEG's stereo header (JPS), or ""."""
     for name, data in getattr(image, "applist", ()):
         if name == "APP3" and data[:8] == JPS and len(data) >= JPS_BYTES:
             flags, kind, is_stereo = data[11], JPS_LAYOUTS.get(data[12], ""), data[13] == 1
@@ -262,10 +236,7 @@ def _viewpoint(image: Any) -> int | None:
 
 
 def picture_size(coded: bytes) -> tuple[int, int]:
-    """Return an encoded picture's stored width and height, without applying the EXIF orientation.
-
-    Raises ValueError if the header cannot be decoded.
-    """
+    """Return an encoded picture's stored width and height, before rotation. Raises ValueError."""
     try:
         with opened(coded) as image:
             width, height = image.size
@@ -275,13 +246,8 @@ def picture_size(coded: bytes) -> tuple[int, int]:
 
 
 def undecodable(data: bytes, error: Exception | None = None) -> str:
-    """Return the reason why a picture cannot be decoded, worded as the end of a message.
-
-    The reason is either an unsupported format, given with a remedy, or a damaged file.
-
-    Args:
-        data: Encoded picture.
-        error: Exception raised by Pillow, or None if the picture was not opened.
+    """Return why a picture cannot be decoded, as the end of a message: a remedy for its format, or
+    damage. `error` is Pillow's, or None if the picture was not opened.
     """
     from PIL import UnidentifiedImageError
 
@@ -322,9 +288,8 @@ def _promises_more(data: bytes) -> bool:
 
 def is_cut_off(coded: bytes) -> bool:
     """Return True if a PNG is incomplete: a chunk extends beyond the file, or the last chunk is missing.
-
-    Returns False for other formats. For an incomplete picture, OpenCV would allocate the size declared in the header,
-    which can be up to 2 GiB however small the file is.
+    For an incomplete picture, OpenCV would allocate the size declared in the header, which can be up to 2 GiB however
+    small the file is.
     """
     if not coded.startswith(PNG):
         return False
@@ -338,9 +303,8 @@ def is_cut_off(coded: bytes) -> bool:
 
 
 def _orientation(image: Any) -> int:
-    """Return the EXIF orientation stored before the pixels, or 1.
-
-    Pillow rotates TIFF pictures itself. Pillow's `getexif` is not suitable, because it would decompress a whole PNG.
+    """Return the EXIF orientation stored before the pixels, or 1. Pillow rotates TIFF pictures itself. Pillow's
+    `getexif` is not suitable, because it would decompress a whole PNG.
     """
     from PIL import Image
 
@@ -357,17 +321,9 @@ def _orientation(image: Any) -> int:
 def check_size(
     width_px: int, height_px: int, *, source: str | Path, field: str = "", name: str = "", head: bytes = b""
 ) -> None:
-    """Check a picture's size against the limits.
-
-    The pixel limit for a PNG with 16 bits per channel is half that for other pictures.
-
-    Args:
-        field: Field in the file to name in messages.
-        name: Name of the picture within the file.
-        head: First bytes of the encoded picture, used to detect 16 bits per channel.
-
-    Raises:
-        InputError: The picture has more pixels than allowed, or one side is longer than SIDE_MAX_PX.
+    """Check a picture's size against the limits, half for PNGs with 16 bits a channel, by `head`, its
+    first bytes. Raises InputError, which names `source`, `field` and `name`, for too many pixels or a side above
+    SIDE_MAX_PX.
     """
     is_deep = head.startswith(PNG) and head[PNG_DEPTH] == b"\x10"
     most = LIMITS.pixels // (2 if is_deep else 1)
@@ -377,15 +333,8 @@ def check_size(
 
 
 def decoded_picture(coded: bytes, *, source: str | Path, field: str, name: str) -> Any:
-    """Decode a picture contained in a file, and return the Pillow image.
-
-    Args:
-        coded: Encoded picture.
-        field: Field in the file to name in messages.
-        name: Name of the picture within the file.
-
-    Raises:
-        InputError: The picture is damaged or incomplete, or has too many pixels.
+    """Decode a picture contained in a file to a Pillow image. Raises InputError, which names `source`,
+    `field` and `name`, if it is damaged, incomplete or too large.
     """
     try:
         width, height = picture_size(coded)
@@ -400,20 +349,14 @@ def decoded_picture(coded: bytes, *, source: str | Path, field: str, name: str) 
 
 
 def camera_set_in(folder: Path) -> str:
-    """Return a message if a folder contains a camera set, which cannot be drawn, or else an empty string.
-
-    A camera set is a collection of photos with camera poses, as used to train a NeRF.
-    """
+    """Return a message if a folder contains photos with camera poses, as for a NeRF, or else ""."""
     sets = sorted(folder.glob("transforms*.json"))
     return f"contains a set of cameras for training a NeRF ({sets[0].name}); {CAMERA_SET}" if sets else ""
 
 
 def read_coded(path: Path) -> tuple[bytes, Header]:
-    """Read a picture file's bytes, and read and check its header.
-
-    Raises:
-        InputError: The file cannot be read, is not a supported picture or exceeds a limit, or the path is a folder with
-            a camera set.
+    """Read a picture file's bytes and its checked header. Raises InputError, also for a camera set's
+    folder.
     """
     if untrusted_input.is_there(path, folder=True) and (problem := camera_set_in(path)):
         raise InputError(path, "", problem)
@@ -422,9 +365,6 @@ def read_coded(path: Path) -> tuple[bytes, Header]:
 
 
 def header_of_file(path: Path) -> Header:
-    """Read and check a picture file's header.
-
-    Raises InputError if the file cannot be read, is not a supported picture, or exceeds a limit.
-    """
+    """Read and check a picture file's header. Raises InputError."""
     with untrusted_input.open_regular(path, most_bytes=LIMITS.file_bytes) as file:
         return _header_of(path, file)

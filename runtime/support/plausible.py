@@ -52,7 +52,7 @@ def check_text(value: str) -> str:
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
-    """Return a hint such as `: did you mean model?` if a known word is similar, or else an empty string.
+    """Return a hint such as `: did you mean model?` if a known word is similar, or else "".
 
     >>> nearest("modle", ["model", "loop"])
     ': did you mean model?'

@@ -21,10 +21,7 @@ def is_plugin(name: str) -> bool:
 
 
 def located(name: str, folder: Path) -> str:
-    """Resolve a setting that may be a relative path against a folder.
-
-    Names (words without a slash or suffix), URLs (`rtsp://...`) and classes (`module:Class`) are returned unchanged.
-    """
+    """Resolve a relative path against a folder; names, URLs and `module:Class` are returned unchanged."""
     if "://" in name or is_plugin(name):
         return name
     if not name or "\0" in name or not ("/" in name or Path(name).suffix):
@@ -33,16 +30,8 @@ def located(name: str, folder: Path) -> str:
 
 
 def plugin_class(name: str, base: type, *, field: str) -> Any:
-    """Import a plugin's class.
-
-    Args:
-        name: Class name in the form `module:Class`.
-        base: Class that the plugin must be derived from.
-        field: Setting to name in messages.
-
-    Raises:
-        InputError: The module cannot be imported, or does not contain a class of that name derived from `base`.
-        MissingPart: The module needs an optional package that is installed by one of phasestack's extras.
+    """Import a plugin's class `module:Class`, derived from `base`, for a setting. Raises InputError if
+    that fails, and MissingPart if an extra of phasestack is missing.
     """
     module, _, attribute = name.partition(":")
     try:
@@ -61,10 +50,7 @@ def plugin_class(name: str, base: type, *, field: str) -> Any:
 
 
 def strict(options: type[BaseModel]) -> type[BaseModel]:
-    """Return a variant of a plugin's options that rejects unknown keys.
-
-    If a class's model configuration sets `extra`, the class is returned unchanged.
-    """
+    """Return a variant of a plugin's options that rejects unknown keys, unless its class sets `extra`."""
     if "extra" in options.model_config:
         return options
     return type(options.__name__, (options,), {"__module__": __name__, "model_config": {"extra": "forbid"}})

@@ -133,22 +133,14 @@ def _pair(undo: contextlib.ExitStack, theirs: contextlib.ExitStack) -> tuple[Cha
 
 
 class Worker:
-    """A part of the program that runs in its own process.
-
-    All methods are for one thread, such as the presenter's, and none of them waits, except `wait_ready` and `close`.
-    A thread of this object's own starts, watches and restarts the process. It also passes on its log lines.
+    """A part of the program that runs in its own process. All methods are for one thread, such as the
+    presenter's, and none of them waits, except `wait_ready` and `close`. A thread of this object's own starts, watches
+    and restarts the process. It also passes on its log lines.
     """
 
     def __init__(self, role: Role, arguments: Callable[[], tuple[Any, ...]], *, files: Sequence[int] = ()) -> None:
-        """Start the process.
-
-        Args:
-            role: What the worker does.
-            arguments: Function that returns the arguments for a new process. Called on this object's thread.
-            files: File descriptors that the process inherits, under the same numbers.
-
-        Raises:
-            TransientError: No thread can be started.
+        """Start the process, which inherits file descriptors under the same numbers. `arguments` are created for each
+        new process, on this object's thread. Raises TransientError without a thread.
         """
         self.role, self._arguments, self._files = role, arguments, tuple(files)
         self._lives: deque[_Life] = deque()  # oldest first; the oldest may have ended, with messages still to be read
@@ -161,14 +153,7 @@ class Worker:
         self._keeper = begin(f"{role.name}'s keeper", self._keep)
 
     def wait_ready(self, go_on: Callable[[], bool] = lambda: True) -> None:
-        """Wait until the first process is ready.
-
-        Args:
-            go_on: Function polled during the wait. If it returns False, waiting ends without an error.
-
-        Raises:
-            BaseException: The error that ended the process.
-        """
+        """Wait until the first process is ready or `go_on` returns False. Raises the error that ended it."""
         while not self._ready.wait(LOOK_S) and go_on():
             pass
         if self.error is not None:
@@ -186,10 +171,7 @@ class Worker:
         return "" if self.is_ready else f"{self._last_reason or f'the {self.role.name} is starting'}"
 
     def send(self, message: Any) -> bool:
-        """Send a message to the newest process. Return False if it was not sent.
-
-        No message is sent before the process is ready, nor if it has too many messages unread.
-        """
+        """Send a message. Return False if the process is not ready or has too many messages unread."""
         life = self._newest
         if life is None or not self.is_ready:
             return False
@@ -219,11 +201,7 @@ class Worker:
         return messages
 
     def restart(self, reason: str) -> None:
-        """Kill the process, so that another one is started.
-
-        Args:
-            reason: What to report, such as `has lost its OpenGL context`.
-        """
+        """Kill the process, so that another one is started. A reason is `has lost its OpenGL context`."""
         if self._newest is not None and self._newest.is_alive():
             self._newest.kill(f"the {self.role.name} {reason}")
 
@@ -361,10 +339,7 @@ def own_bytes(pid: int) -> int:
 
 
 def usage(pid: int | None) -> dict[str, Any]:
-    """Return a process's `pid`, `memory_mib` and `cpu_s`, which are None if it has ended.
-
-    The memory includes a part of what it shares with other processes (Linux's `Pss`).
-    """
+    """Return a process's `pid`, `memory_mib` (with its part of shared memory, Pss) and `cpu_s`, or None."""
     memory_mib = cpu_s = None
     if pid is not None:
         with contextlib.suppress(OSError, ValueError, IndexError):
@@ -394,25 +369,18 @@ class Parent:
         self._words[READY] = 1
 
     def receive(self, timeout_s: float = 0.0) -> list[Any]:
-        """Return all messages that have arrived, oldest first, or wait for one.
-
-        Raises ChannelClosed at the end.
-        """
+        """Return all messages that have arrived, oldest first, or wait for one. Raises ChannelClosed."""
         return self._channel.receive(timeout_s)
 
     def send(self, message: Any) -> None:
-        """Send a message. If the parent reads nothing for now, wait, which does not count as hanging.
-
-        Raises ChannelClosed if the parent has closed the channel.
-        """
+        """Send a message, if need be waiting, which does not count as hanging. Raises ChannelClosed."""
         while not self._channel.send(message, timeout_s=SENT_S):
             self.allow(self._allowed_s)
         self._sent += 1
 
     def offer(self, message: Any) -> bool:
-        """Send a message without waiting. Return False if the parent has too many messages unread.
-
-        Raises ChannelClosed if the parent has closed the channel.
+        """Send a message without waiting. Return False if the parent has too many messages unread. Raises
+        ChannelClosed if the parent has closed the channel.
         """
         is_sent = self._channel.send(message)
         self._sent += is_sent
@@ -441,14 +409,8 @@ class _Forwarded(logging.Handler):
 
 
 def main(parent: int, channel: int, notes: int, words: int, trace: int) -> int:
-    """Run a worker's process, and return its exit status.
-
-    Args:
-        parent: The parent's process number.
-        channel: File descriptor of the channel to the parent.
-        notes: File descriptor of the channel for log lines and errors.
-        words: File descriptor of the words shared with the parent.
-        trace: File descriptor for the stacks left by a crash.
+    """Run a worker's process, and return its exit status. Arguments: the parent's number, and descriptors
+    of the channel, of log lines and errors, of words shared with the parent, and for the stacks left by a crash.
     """
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # end when the parent ends
     if os.getppid() != parent:  # it has ended already

@@ -23,12 +23,8 @@ _LISTENER: ContextVar[Listener | None] = ContextVar("progress", default=None)
 
 
 def tell(what: str, done: int, total: int | None = None) -> None:
-    """Report progress to the listener, if there is one. Exceptions raised by the listener propagate.
-
-    Args:
-        what: Task name. An empty name reports that the task has ended.
-        done: Number of finished steps.
-        total: Total number of steps, or None if unknown.
+    """Report a task's finished steps, of a known total or not, to any listener, whose exceptions
+    propagate. An empty name reports that the task has ended.
     """
     listener = _LISTENER.get()
     if listener is not None:
@@ -37,14 +33,8 @@ def tell(what: str, done: int, total: int | None = None) -> None:
 
 @contextmanager
 def task(what: str, *, seconds: float, too_slow: Exception) -> Iterator[None]:
-    """Report when the task within the block begins and ends, and limit the task's time.
-
-    An outer listener still receives all reports.
-
-    Args:
-        what: Task name.
-        seconds: Time limit.
-        too_slow: Exception that `tell` raises within the block once the time limit has passed.
+    """Report when the task within the block begins and ends, also to an outer listener. After `seconds`,
+    `tell` raises `too_slow` within the block.
     """
     end, outer = time.monotonic() + seconds, _LISTENER.get()
 
@@ -74,11 +64,7 @@ def listening(listener: Listener) -> Iterator[None]:
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[Callable[[int, int], None]]:
-    """Yield a function that reports a task's finished steps and total steps.
-
-    Args:
-        title: Task name, shown next to the progress bar.
-    """
+    """Yield a function that shows a task's finished and total steps next to its title."""
     try:
         yield lambda done, total: tell(title, done, total)
     finally:
@@ -87,11 +73,7 @@ def progress_bar(title: str) -> Iterator[Callable[[int, int], None]]:
 
 @contextmanager
 def status_line(title: str) -> Iterator[Callable[[str], None]]:
-    """Yield a function that reports a text as a task's current step.
-
-    Args:
-        title: Task name, shown before the text.
-    """
+    """Yield a function that shows a text as a task's current step behind its title."""
     try:
         yield lambda text: tell(f"{title}: {text}", 0)
     finally:

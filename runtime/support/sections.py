@@ -37,10 +37,8 @@ UNION_MEMBER = re.compile(r"literal\[.*\]|constrained-\w+")  # a type's name in 
 
 
 class Section(BaseModel):
-    """Base class for the records that tables are validated against.
-
-    Records are frozen. Unknown keys, non-finite numbers, true and false in place of numbers, and strings that are not
-    valid names or paths are rejected.
+    """Base class for the records that tables are validated against. Records are frozen. Unknown keys,
+    non-finite numbers, true and false in place of numbers, and strings that are not valid names or paths are rejected.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -76,11 +74,7 @@ def _spelt(value: Any) -> Any:
 
 
 def read_table(path: Path) -> dict[str, Any]:
-    """Read the table in a TOML or JSON file.
-
-    Raises InputError if the file cannot be read, is malformed, or contains a JSON value other than an object. For a
-    malformed file, the message names the line.
-    """
+    """Read the table in a TOML or JSON file. Raises InputError, for a malformed file with the line."""
     text = untrusted_input.read_text(path, most_bytes=TABLE_BYTES_MAX)
     table = untrusted_input.parsed_json(text, source=path) if path.suffix.lower() == ".json" else _toml(text, path)
     if not isinstance(table, dict):
@@ -101,15 +95,8 @@ def _toml(text: str, path: Path) -> Any:
 
 
 def validated(model: type[M], table: dict[str, Any], *, source: str | Path, folder: Path | None = None) -> M:
-    """Validate a table and return the record.
-
-    Args:
-        model: Record class.
-        table: Table to validate.
-        folder: Folder that relative paths are resolved against (`runtime.config.paths`). None: leave paths unchanged.
-
-    Raises:
-        InputError: A field is invalid, missing or unknown. The message names every such field.
+    """Validate a table as a record, with paths relative to a folder (`runtime.config.paths`), if any.
+    Raises InputError, which names every field that is invalid, missing or unknown.
     """
     try:
         return model.model_validate(table, context=folder)

@@ -17,9 +17,8 @@ Result = TypeVar("Result")
 
 
 def parallel_map(work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-    """Call `work` on every item in parallel, and return the results in the same order as the items.
-
-    Uses as many threads as OpenCV is configured to use (`cv2.getNumThreads`). Exceptions raised by `work` propagate.
+    """Call `work` on every item, in as many threads as OpenCV uses, and return the results in order.
+    Exceptions raised by `work` propagate.
     """
     threads = cv2.getNumThreads()
     if threads < 2 or len(items) < 2:
@@ -33,12 +32,8 @@ def parallel_map(work: Callable[[Item], Result], items: Sequence[Item]) -> list[
 
 
 def on_rows(work: Callable[[int, int], None], rows: int, *, threads: int | None = None) -> None:
-    """Split rows into parts of about equal size, and call `work(begin, end)` for each part in parallel.
-
-    Args:
-        work: Function that processes the rows from `begin` up to but excluding `end`.
-        rows: Total number of rows.
-        threads: Number of parts. By default, OpenCV's number of threads.
+    """Split rows into `threads` parts, by default OpenCV's, and call `work(begin, end)` for each in
+    parallel.
     """
     parts = threads or max(1, cv2.getNumThreads())
     parallel_map(lambda span: work(*span), list(pairwise(rows * part // parts for part in range(parts + 1))))

@@ -1,7 +1,8 @@
 """Read untrusted input (paths, files, JSON, numbers) within limits.
 
 All untrusted bytes are read through this module. For invalid input, the functions raise InputError with a one-line
-message that names the file, the field and, if applicable, the limit that was exceeded.
+message that names the file (`source`, by default the path), the `field` and, if applicable, the limit that was
+exceeded.
 """
 
 from __future__ import annotations
@@ -46,14 +47,8 @@ LIMITS = Limits()  # not configurable; tests lower them
 
 
 def checked_path(path: str | Path, *, source: str | Path = "", field: str = "") -> Path:
-    """Check that a path is valid on this system, and return it. The path need not exist.
-
-    Args:
-        source: File to name in messages, by default the path itself.
-        field: Setting or field to name in messages.
-
-    Raises:
-        InputError: The path is too long, contains a NUL character or is not UTF-8.
+    """Return a path, which need not exist. Raises InputError if it is too long, contains NUL or is not
+    UTF-8.
     """
     try:
         os.lstat(path)
@@ -66,16 +61,9 @@ def checked_path(path: str | Path, *, source: str | Path = "", field: str = "") 
 
 
 def path_within_folder(path: str, *, source: str | Path, field: str) -> Path:
-    """Check that a relative path does not leave its folder, and return the normalized path.
-
-    The path need not exist. Symbolic links are not resolved, because the owner of the folder has put them there.
-
-    Args:
-        path: Path in an untrusted file, relative to the folder of that file.
-        field: Field to name in messages.
-
-    Raises:
-        InputError: The path is invalid, absolute, or leads out of the folder.
+    """Return the normalized relative path, which need not exist, from an untrusted file in the same
+    folder. Symbolic links are not resolved, because the owner of the folder has put them there. Raises InputError if
+    the path is invalid, absolute, or leads out of the folder.
     """
     name = Path(os.path.normpath(checked_path(path, source=source, field=field)))
     if name.is_absolute():
@@ -90,10 +78,8 @@ def path_within_folder(path: str, *, source: str | Path, field: str) -> Path:
 
 
 def spelled(folder: Path, name: Path) -> Path | None:
-    """Return the existing file in a folder with a given relative name, or None.
-
-    If there is none, letter case and the Unicode form of letters such as é are ignored, as on the systems where names
-    that differ in them alone are written.
+    """Return the existing file with a relative name in a folder, or None. As on systems that write such
+    names, letter case and the Unicode form of letters such as é may differ.
     """
     if (folder / name).exists():
         return folder / name
@@ -108,14 +94,7 @@ def _folded(name: str) -> str:
 
 
 def is_there(path: str | Path, *, folder: bool = False) -> bool:
-    """Return True if a path exists.
-
-    Args:
-        folder: Also require that the path is a folder.
-
-    Raises:
-        InputError: The path is invalid, or the system refuses the check.
-    """
+    """Return True if a path exists and, for `folder`, is one. Raises InputError if it cannot be checked."""
     checked = checked_path(path)
     try:
         return checked.is_dir() if folder else checked.exists()
@@ -126,18 +105,9 @@ def is_there(path: str | Path, *, folder: bool = False) -> bool:
 def open_regular(
     path: str | Path, *, most_bytes: int | None = None, source: str | Path = "", field: str = ""
 ) -> IO[bytes]:
-    """Open a regular file for reading.
-
-    Never blocks, unlike `open` on a FIFO without a writer. The checks are made on the open file, so that it cannot be
-    exchanged in the meantime.
-
-    Args:
-        most_bytes: Maximum file size. None: any size.
-        source: File to name in messages, by default the path.
-        field: Setting or field to name in messages.
-
-    Raises:
-        InputError: The file cannot be opened, is not a regular file or is larger than `most_bytes`.
+    """Open a regular file of at most `most_bytes` for reading. Raises InputError if that fails. Never
+    blocks, unlike `open` on a FIFO without a writer. The open file is checked, so that it cannot be exchanged in the
+    meantime.
     """
     name = source or str(path)
     checked = checked_path(path, source=source, field=field)
@@ -158,10 +128,7 @@ def open_regular(
 
 
 def read_bytes(path: str | Path, *, most_bytes: int, source: str | Path = "", field: str = "") -> bytes:
-    """Read a regular file. The arguments are the same as for `open_regular`.
-
-    Raises InputError if the file cannot be read, is not a regular file or is larger than `most_bytes`.
-    """
+    """Read a regular file, with the arguments and errors of `open_regular`."""
     name = source or str(path)
     with open_regular(path, most_bytes=most_bytes, source=source, field=field) as file:
         try:
@@ -177,10 +144,7 @@ def read_bytes(path: str | Path, *, most_bytes: int, source: str | Path = "", fi
 
 
 def read_text(path: str | Path, *, most_bytes: int = JSON_BYTES_MAX) -> str:
-    """Read a text file in UTF-8, or in UTF-16 with a byte-order mark.
-
-    Raises InputError if the file cannot be read, is larger than `most_bytes` or is neither.
-    """
+    """Read a text file in UTF-8, or in UTF-16 with a byte-order mark. Raises InputError for others."""
     return decoded(read_bytes(path, most_bytes=most_bytes), source=path)
 
 
@@ -195,22 +159,13 @@ def decoded(data: bytes, *, source: str | Path) -> str:
 
 
 def read_json(path: str | Path, *, most_bytes: int = JSON_BYTES_MAX) -> Any:
-    """Read a JSON file of at most `most_bytes`.
-
-    Raises InputError if the file cannot be read or `parsed_json` rejects the content.
-    """
+    """Read a JSON file of at most `most_bytes`. Raises InputError as `parsed_json` does."""
     return parsed_json(read_bytes(path, most_bytes=most_bytes), source=path)
 
 
 def parsed_json(text: str | bytes, *, source: str | Path, most_depth: int = JSON_DEPTH_MAX) -> Any:
-    """Parse strict JSON, which excludes NaN, Infinity and repeated keys.
-
-    Args:
-        text: JSON text, as a string or as UTF-8 bytes.
-        most_depth: Maximum depth of nested lists and objects.
-
-    Raises:
-        InputError: The text is malformed, contains too many values or is nested too deeply.
+    """Parse strict JSON, which excludes NaN, Infinity and repeated keys. Raises InputError if it is
+    malformed, contains too many values or is nested deeper than `most_depth`.
     """
     data = text if isinstance(text, bytes) else text.encode(errors="surrogatepass")
     within(sum(map(data.count, (b",", b"{", b"["))), LIMITS.json_values, source=source, field="JSON values")
@@ -265,16 +220,7 @@ def whole_from_text(text: str, *, source: str | Path, field: str) -> int:
 
 
 def within(count: int | float, most: int | float, *, source: str | Path, field: str) -> None:
-    """Check a count against a limit.
-
-    Args:
-        count: Count to check.
-        most: Limit.
-        field: What is counted, for messages, such as `JSON values`.
-
-    Raises:
-        InputError: The count exceeds the limit.
-    """
+    """Check a count against a limit. Raises InputError with the `field` counted, such as `JSON values`."""
     if count > most:
         raise InputError(source, field, f"{count:,} exceeds the limit of {most:,}")
 
