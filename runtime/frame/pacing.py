@@ -22,22 +22,15 @@ MOST_HELD_WORK = 0.9  # the same if drawn frames are held back until they are du
 
 
 class Pacer:
-    """Schedules refreshes in slots spaced one refresh period apart.
-
-    Each slot that cannot be met counts as missed. A refresh skipped on purpose because the picture has not changed
-    keeps its slot and does not count as missed.
+    """Schedules refreshes in slots spaced one refresh period apart. Each slot that cannot be met counts
+    as missed. A refresh skipped on purpose because the picture has not changed keeps its slot and does not count as
+    missed.
     """
 
     def __init__(self, *, period_ns: int, photon_ns: int, work_ns: int = 0) -> None:
-        """Create a pacer for a display.
-
-        Args:
-            period_ns: The display's refresh period.
-            photon_ns: Time from presenting a refresh to the middle of its time on the display.
-            work_ns: Initial estimate of the time needed from waking to presenting.
-
-        Raises:
-            ValueError: The period is not positive.
+        """Create a pacer for a display. Raises ValueError if the period is not positive. `photon_ns` is the time from
+        presenting a refresh to the middle of its time on the display, and `work_ns` an initial estimate of the time
+        from waking to presenting.
         """
         if period_ns <= 0:
             raise ValueError("period_ns must be positive")
@@ -75,16 +68,9 @@ class Pacer:
         blank_ns: int | None = None,
         held_ns: int | None = None,
     ) -> int:
-        """Record what happened to a refresh, and return the best estimate of its display time.
-
-        Args:
-            timing: The refresh's predicted times.
-            woke_ns: When the refresh woke.
-            done_ns: When presenting was done.
-            blank_ns: Time of the vertical blank at which the refresh appeared. None if the display driver does not
-                report blanks or skipped the swap.
-            held_ns: How long the drawn frame waited until it was due. None if no frame was drawn or the output never
-                waits.
+        """Record what happened to a refresh, and return the best estimate of its display time. `blank_ns` is
+        the vertical blank at which it appeared, None if unknown or if the swap was skipped. `held_ns` is how long the
+        drawn frame waited until it was due, None if none was drawn or the output never waits.
         """
         self._holds = held_ns is not None or (self._holds and blank_ns is None)
         if held_ns is not None:

@@ -45,15 +45,7 @@ class SceneCell:
         scene: int = 1,
         first_number: int = 1,
     ) -> None:
-        """Create a cell.
-
-        Args:
-            settings: Settings that the content and the model were loaded with.
-            content: The scene.
-            version: Version of the first state.
-            scene: Number of the scene.
-            first_number: Number of the first solution. An earlier solver of the run may have used lower ones.
-        """
+        """Create a cell of loaded content and model. An earlier solver of the run may have used lower numbers."""
         self._numbers = count(first_number)
         self.state = SceneState(version, scene, settings, content, predictor)
 
@@ -62,10 +54,7 @@ class SceneCell:
         return next(self._numbers)
 
     def replace(self, **changes: Any) -> SceneState:
-        """Replace some of the state's fields and return the old state.
-
-        The caller must close any content or model that was replaced.
-        """
+        """Replace fields of the state and return the old one, whose replaced parts the caller must close."""
         before = self.state
         scene = before.scene + (changes.get("content", before.content) is not before.content)
         self.state = replace(before, version=before.version + 1, scene=scene, **changes)

@@ -62,14 +62,8 @@ class SolverProcess(SolverHost):
         *,
         contexts_lost: Callable[[], int] = lambda: 0,
     ) -> None:
-        """Start a solver.
-
-        Args:
-            role: The worker's main function, called with the shared memory's file descriptor and a setup; its limits.
-            setup: Function that returns what to start a solver with. Called on another thread.
-            clock: The run's clock, which must be the machine's monotonic clock.
-            contexts_lost: Function that returns the number of GL contexts lost by the panels. The solver is replaced
-                whenever it changes.
+        """Start a solver, whose `setup` is read on another thread. The clock must be the machine's. The solver is
+        replaced whenever the number of GL contexts lost by the panels changes.
         """
         super().__init__()
         self._clock, self._setup, self._contexts_lost = clock, setup, contexts_lost
@@ -89,14 +83,7 @@ class SolverProcess(SolverHost):
         self._worker = Worker(role, lambda: (self._memory, self._setup(self._known)), files=(self._memory,))
 
     def wait_ready(self, go_on: Callable[[], bool] = lambda: True) -> None:
-        """Wait until the first solver is ready.
-
-        Args:
-            go_on: Function polled during the wait. If it returns False, waiting ends without an error.
-
-        Raises:
-            BaseException: The error that prevented the solver from starting.
-        """
+        """Wait until the first solver is ready or `go_on` returns False. Raises the error that prevented it."""
         self._worker.wait_ready(go_on)
         self._lost_before = self._contexts_lost()
         self._take_in()

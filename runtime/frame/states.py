@@ -29,10 +29,7 @@ class Conditions:
 
 
 def judge(conditions: Conditions) -> tuple[State, str]:
-    """Return the daemon's state and the reason for it.
-
-    In order of precedence: stopping, starting, missing parts, the state of the eyes.
-    """
+    """Return the daemon's state and its reason, by precedence: stopping, starting, missing parts, eyes."""
     if conditions.stopping:
         return State.STOPPING, conditions.stopping
     missing = [part for part in PARTS if part in conditions.missing]
@@ -70,10 +67,7 @@ class StateMachine:
         return f"{self.state}: {', '.join(self.missing)}" if self.state is State.DEGRADED else str(self.state)
 
     def update(self, conditions: Conditions, *, now_ns: int) -> bool:
-        """Update the state, and return True if the state or the set of failed parts has changed.
-
-        Once the state is STOPPING, it no longer changes.
-        """
+        """Update the state, unless STOPPING, and return True if it or the set of failed parts has changed."""
         self._held_ns[self.state] += now_ns - self._counted_ns
         self._counted_ns = now_ns
         if self.state is State.STOPPING:
@@ -98,10 +92,7 @@ REFRESHES_MAX = 1024  # maximum number of refreshes counted in the window
 
 
 class Lateness:
-    """Detects a late display.
-
-    The display is late once it has shown too few refreshes per second for more than one second.
-    """
+    """Detects a late display, which has shown too few refreshes per second for more than one second."""
 
     def __init__(self, period_ns: int) -> None:
         self._wanted = WINDOW_NS / period_ns
@@ -112,10 +103,7 @@ class Lateness:
         self._told_ns = 0
 
     def update(self, *, presented: bool, now_ns: int) -> str:
-        """Count a refresh, and return a message if the display is late, or "" if it is on time.
-
-        An example of the message is `late: 38 of 60 refreshes per second`. It is updated at most once per second.
-        """
+        """Count a refresh, and return "" or, updated every second, `late: 38 of 60 refreshes per second`."""
         if self._begun_ns is None:
             self._begun_ns = now_ns
         if presented:

@@ -24,10 +24,8 @@ OVERHEAD_STAGES = ("sensor", "track")
 
 
 class Quantiles:
-    """Estimates the quantiles of a stream of values in bounded memory.
-
-    Stores at most `size` values. When the store is full, every second value is dropped and the sampling interval is
-    doubled. The maximum is exact.
+    """Estimates the quantiles of a stream of values in bounded memory. Stores at most `size` values. When
+    the store is full, every second value is dropped and the sampling interval is doubled. The maximum is exact.
     """
 
     def __init__(self, size: int = WINDOW) -> None:
@@ -71,12 +69,8 @@ class RunStats:
         self._recent: deque[tuple[int, bool, bool]] = deque(maxlen=NOW_KEPT)  # time, presented, shows new solution
 
     def add(self, account: RefreshAccount, *, overhead_ms: float, missed_blanks: int = 0) -> None:
-        """Count a refresh.
-
-        Args:
-            account: The refresh's account.
-            overhead_ms: Time taken by the refresh on the machine's clock, excluding presenting and waiting.
-            missed_blanks: Number of vertical blanks missed since the run started.
+        """Count a refresh. Overhead is on the machine's clock, without presenting and waiting.
+        `missed_blanks` counts from the start of the run.
         """
         now_ns, ran = account.present_ns, account.inference == "ran"
         self._first_ns = now_ns if self._first_ns < 0 else self._first_ns
@@ -121,10 +115,7 @@ class RunStats:
         return sum(known) if known and self.presented > self.solutions > 0 else None
 
     def rates_now(self) -> dict[str, float | None]:
-        """Return the number of refreshes and of solutions per second, measured over the last second.
-
-        Both rates are None if there were fewer than two refreshes in the last second.
-        """
+        """Return the refreshes and solutions per second over the last second, or None below two refreshes."""
         newest_first = reversed(tuple(self._recent))
         recent = [*takewhile(lambda entry: entry[0] > self._last_ns - NOW_NS, newest_first)][::-1]
         if len(recent) < 2:
@@ -140,14 +131,9 @@ class RunStats:
         self.faults[part] = self.faults.get(part, 0) + 1
 
     def summary(self, *, stale_inputs: int, simulated: bool = False) -> dict[str, Any]:
-        """Return the counts and times for summary.json (docs/contracts.md).
-
-        Any figure that was not measured is null.
-
-        Args:
-            stale_inputs: Number of samples superseded by a newer one before use.
-            simulated: True if the run's clock is simulated. The overhead is then computed from the configured stage
-                times.
+        """Return the counts and times for summary.json (docs/contracts.md), null if not measured.
+        `stale_inputs` are samples superseded before use. On a simulated clock, the overhead follows from the
+        configuration.
         """
         seconds = self.seconds()
         return {

@@ -32,13 +32,8 @@ class TargetDrawer:
         return self._solver.facts.scene
 
     def draw(self, wanted: Wanted, scene: int | None, then: Callable[[RefreshTargets | None], None]) -> None:
-        """Have the wanted pictures drawn, and pass them to `then`.
-
-        Args:
-            wanted: Eyes and time to draw each pair of pictures for, keyed by field of `RefreshTargets`.
-            scene: The current scene's number at the refresh to draw for. None means the present scene.
-            then: Function called with the pictures on the presenter's thread, or with None if the scene has been
-                replaced or drawing has failed. In the latter case, the run's state gives the reason.
+        """Have the wanted pictures drawn for a scene's number, by default the present one, and pass them to
+        `then`. It is called on the presenter's thread, with None if the scene was replaced or drawing failed.
         """
 
         def answered(answer: Answer) -> None:
@@ -53,13 +48,7 @@ class TargetDrawer:
 
 
 def drawn(order: Draw, content: ContentSource, *, scene: int, stack: PanelStack) -> Drawn:
-    """Draw target pictures, on the solver's thread.
-
-    Args:
-        order: Which pictures to draw.
-        content: The current scene.
-        scene: The current scene's number. If the order names another one, nothing is drawn.
-    """
+    """Draw target pictures, on the solver's thread, unless the order names another scene's number."""
     if order.scene not in (None, scene):
         return Drawn(order.number, None)
     with suppress(ContentFailure):
