@@ -25,6 +25,9 @@ Eyes = F64
 
 EyesLabel = Literal["exact", "interpolated", "predicted", "held", "rested", "none"]
 Inference = Literal["ran", "reused", "skipped"]
+SOLVING_STAGES = ("render", "prepare", "inference", "finish", "step")  # inference: only the network; step: all updates
+SHOWN_STAGES = SOLVING_STAGES[:-1]  # in frames.jsonl, where `finish` includes the steps
+STAGES = ("sensor", "track", *SOLVING_STAGES, "present", "wait")
 
 
 class State(StrEnum):

@@ -13,6 +13,7 @@ from pydantic import AfterValidator, Field, ValidationInfo, field_validator, mod
 from runtime.config.paths import NameOrPath, PathText, path_in
 from runtime.kernels import MAX_PANELS
 from runtime.optics.stack import PanelStack, Tilt
+from runtime.records import STAGES
 from runtime.support.plausible import nearest, within
 from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG
 from runtime.support.sections import Section
@@ -370,9 +371,6 @@ class OutputSettings(Section):
     panels: tuple[PanelSettings, ...] = Field(
         (), max_length=MAX_PANELS, description="one table per panel, from rear to front"
     )
-
-
-STAGES = ("sensor", "track", "render", "prepare", "inference", "finish", "step", "present", "wait")
 
 
 def _check_stages(cost_ms: dict[str, float]) -> dict[str, float]:

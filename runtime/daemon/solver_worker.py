@@ -11,11 +11,11 @@ import numpy as np
 
 from runtime.clock import NS_PER_MS
 from runtime.daemon.solver_parts import RunningSolver, SolverSetup
-from runtime.frame.effort import REST, SOLVING_STAGES, CostBook
+from runtime.frame.effort import REST, CostBook
 from runtime.frame.messages import Busy, Idle, Live, Order, Slot, SolverUpdate, Stepped
 from runtime.frame.solver_host import first_request
 from runtime.model.buffers import LayerSlots
-from runtime.records import Solution, SolveRequest
+from runtime.records import SOLVING_STAGES, Solution, SolveRequest
 from runtime.support.memory import keep_freed_memory
 from runtime.support.process import Parent, Role
 from runtime.support.untrusted_input import LIMITS

@@ -23,9 +23,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
-from runtime.records import Effort, Measures
+from runtime.records import SOLVING_STAGES, Effort, Measures
 
-SOLVING_STAGES = ("render", "prepare", "inference", "finish", "step")
 FOCUS_DRAWN, FOCUS_STEP = 5, 3  # with focus, the drawn pictures per eye, and a step's cost relative to one without
 REST = "rest"  # time between two solutions that belongs to no stage, for measurements and for waking up
 HORIZON_S = 1.0  # how long head and content are assumed to continue as they are

@@ -25,7 +25,7 @@ from runtime.frame.messages import SolverUpdate
 from runtime.frame.pacing import Pacer
 from runtime.frame.policy import Flatness, wants_flat
 from runtime.frame.run_state import RunState
-from runtime.frame.solver_host import SHOWN_STAGES, SolverHost
+from runtime.frame.solver_host import SolverHost
 from runtime.frame.states import Conditions, Lateness, Part, StateMachine
 from runtime.frame.stats import RunStats
 from runtime.frame.viewer import Viewer
@@ -34,6 +34,7 @@ from runtime.optics.stack import PanelStack
 from runtime.panels.base import PanelSink
 from runtime.plan.savings import selected_eyes
 from runtime.records import (
+    SHOWN_STAGES,
     Effort,
     EyesEstimate,
     FrameTiming,

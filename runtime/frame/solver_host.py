@@ -18,9 +18,6 @@ def first_request(now_ns: int) -> SolveRequest:
     return SolveRequest(now_ns, None, "none", 0.0, flat_wanted=True)
 
 
-SHOWN_STAGES = ("render", "prepare", "inference", "finish")  # in frames.jsonl, `finish` includes the steps
-
-
 class SolverParts(Protocol):
     """A solver with its scene, its model and its GL context. For use on one thread."""
 

@@ -13,13 +13,11 @@ import numpy as np
 
 from runtime.clock import NS_PER_MS, NS_PER_S
 from runtime.evaluation.refresh_quality import view_error_mm
-from runtime.frame.solver_host import SHOWN_STAGES
-from runtime.records import RefreshAccount, State
+from runtime.records import SHOWN_STAGES, STAGES, RefreshAccount, State
 
 WINDOW = 8192  # maximum number of values kept for each set of quantiles
 NOW_NS = NS_PER_S  # length of the window used to measure current rates
 NOW_KEPT = 1024  # maximum number of refreshes kept for this window
-STAGES = ("sensor", "track", *SHOWN_STAGES, "present", "wait")
 OVERHEAD_STAGES = ("sensor", "track")
 
 
@@ -60,7 +58,7 @@ class RunStats:
         self.faults: dict[str, int] = {}
         self._first_ns = self._last_ns = -1
         self._last_presented_ns = -1
-        self._stages = {stage: Quantiles() for stage in STAGES}
+        self._stages = {stage: Quantiles() for stage in STAGES if stage != "step"}  # steps count as `finish`
         self._interval, self._photon, self._overhead = Quantiles(), Quantiles(), Quantiles()
         self._overhead_run, self._skew, self._age, self._sigma = Quantiles(), Quantiles(), Quantiles(), Quantiles()
         self._view_error = Quantiles()

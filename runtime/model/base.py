@@ -13,14 +13,14 @@ import numpy as np
 from runtime.clock import Stopwatch
 from runtime.model.job import Job, Savings, grey_job
 from runtime.optics.stack import PanelStack
-from runtime.records import F64, U8, Eyes
+from runtime.records import F64, SOLVING_STAGES, U8, Eyes
 
 if TYPE_CHECKING:
     from runtime.model.buffers import LayerSlots
     from runtime.model.device import SolverBackend
 
 
-STAGES = ("prepare", "inference", "finish", "step")  # inference: only the network; step: all panel updates
+STAGES = SOLVING_STAGES[1:]
 
 
 TRIAL_M, TRIAL_ROOM_M = 0.6, 0.5  # the eyes' minimum distances from the origin and from the front panel
