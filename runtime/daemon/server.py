@@ -26,6 +26,7 @@ from runtime.daemon.client import DEFAULT_SOCKET, LOADED_WITHIN_S, REQUEST_MAX_B
 from runtime.daemon.commands import Command, parse
 from runtime.daemon.socket_file import BACKLOG, SocketInUse, listening_socket
 from runtime.errors import InputError, one_line, without_secrets
+from runtime.records import State
 from runtime.support.artifacts import to_json
 from runtime.support.background import BACKGROUND_NICENESS, begin, patience_s, set_niceness
 
@@ -186,8 +187,16 @@ class StatusServer:
             value = "" if answer.value is None else f" {answer.value}"
             log.info(f"command: {answer.name}{value}")
             self.commands.put(answer)
-            answer = await _outcome(answer, writer)
+            outcome = await _outcome(answer, writer)
+            return _line(outcome or {"ok": False, "error": f"{self._silence()}, so the command was not run"})
         return _line(answer)
+
+    def _silence(self) -> str:
+        """Return why the loop has not answered."""
+        status = self._snapshot[1]()
+        if status.get("state") == State.STARTING:
+            return f"the display is still starting ({status.get('reason', '')})"
+        return f"the display loop did not answer within {LOOP_ANSWERS_WITHIN_S:g} s"
 
 
 def _log_error(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
@@ -208,9 +217,11 @@ def _is_gone(writer: StreamWriter) -> bool:
     return bool(hung_up.poll(0))
 
 
-async def _outcome(command: Command, writer: StreamWriter) -> dict[str, Any]:
-    """Wait for a command's outcome and return the answer. The command is cancelled if the loop does not start it in
-    time or the client disconnects. Raises Refusal if the server is stopped.
+async def _outcome(command: Command, writer: StreamWriter) -> dict[str, Any] | None:
+    """Wait for a command's outcome, and return the answer.
+
+    Returns None and cancels the command if the loop does not start it in time or the client disconnects. Raises Refusal
+    if the server is stopped.
     """
     answer = asyncio.wrap_future(command.answer)
     until_s = time.monotonic() + LOOP_ANSWERS_WITHIN_S
@@ -219,8 +230,7 @@ async def _outcome(command: Command, writer: StreamWriter) -> dict[str, Any]:
         while not done and time.monotonic() < until_s and not _is_gone(writer):
             done, _ = await asyncio.wait({answer}, timeout=min(LOOKED_AGAIN_S, LOOP_ANSWERS_WITHIN_S))
         if not done and command.answer.cancel():
-            problem = f"the display loop did not answer within {LOOP_ANSWERS_WITHIN_S:g} s, so the command was not run"
-            return {"ok": False, "error": problem}
+            return None
         done, _ = await asyncio.wait({answer}, timeout=LOADED_WITHIN_S)
     except asyncio.CancelledError as stops:
         raise Refusal(stops.args[0] + ("; the command was not run" if command.answer.cancel() else "")) from None

@@ -188,6 +188,15 @@ def connected(path: Path) -> socket.socket:
 # Refused commands are never executed
 
 
+def test_a_command_during_the_start_is_told_what_is_awaited(
+    server: StatusServer, path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server_module, "LOOP_ANSWERS_WITHIN_S", 0.05)
+    server.publish(lambda: {"state": "starting", "reason": "loading the scene"})
+    answer = ask([path], {"command": "pause"})
+    assert answer["error"] == "the display is still starting (loading the scene), so the command was not run"
+
+
 def test_a_command_that_was_refused_as_too_late_is_never_done(
     server: StatusServer, path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
