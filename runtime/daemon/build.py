@@ -117,13 +117,8 @@ class Host(Supervisor):
     recorder: Any = None  # additional observer; its `watches` is called before the first refresh
 
     def starting(self, doing: str) -> bool:
-        """Called before each long startup step, and repeatedly while content and model load.
-
-        Args:
-            doing: What is being done, such as "opening panels".
-
-        Returns:
-            False to cancel startup, which takes effect only while content and model load.
+        """Report a startup step, such as "opening panels". Returning False cancels the loading of content and
+        model.
         """
         return True
 
@@ -144,19 +139,11 @@ def build_run(
     output: Output | None = None,
     on_account: Callable[[RefreshAccount], None] | None = None,
 ) -> Run:
-    """Build a run that is ready for its first refresh.
+    """Build a run that is ready for its first refresh. `cleanup` closes all of its parts.
 
-    Args:
-        options: Options that can be set only on the command line.
-        cleanup: Stack that, when closed, closes all of the run's parts.
-        host: Callbacks used during startup and, as the presenter's supervisor, at each refresh. None for no callbacks.
-        output: Destination for the run's files. If None, no files are written.
-        on_account: Function called with each refresh's account.
-
-    Raises:
-        FatalError: A setting or a file cannot be used.
-        PanelLost: A panel is missing and the host does not wait for it.
-        Stopped: The host has cancelled startup.
+    `host` has callbacks during startup and, as the presenter's supervisor, at each refresh; `on_account` gets each
+    refresh's account. Raises FatalError for a setting or a file, PanelLost if the host does not wait for a missing
+    panel, and Stopped if it has cancelled startup.
     """
     host = host or Host()
     if options.scale != 1.0 and settings.output.kind != "offscreen":
@@ -248,14 +235,7 @@ def build_run(
 
 
 def start_sensor(settings: Settings, clock: Clock, link: BrowserLink | None = None) -> LiveSamples:
-    """Return a live sensor that is not polled yet.
-
-    Args:
-        link: Link to a page, which may be the sensor.
-
-    Raises:
-        TransientError: No thread can be started.
-    """
+    """Return a live sensor, maybe a page, that is not polled yet. Raises TransientError without a thread."""
     make_driver = partial(open_sensor, settings.sensor, clock, latency_ms=settings.loop.sensor_latency_ms)
     make_finder = partial(EyeFinder, settings, most_people=settings.sought_people)
     if link is None:
@@ -274,12 +254,7 @@ def start_sensor(settings: Settings, clock: Clock, link: BrowserLink | None = No
 def start_solver(
     settings: Settings, stack: PanelStack, clock: Clock, *, contexts_lost: Callable[[], int]
 ) -> SolverProcess:
-    """Start a solver's process.
-
-    Args:
-        settings: The run's first settings.
-        contexts_lost: Function that returns the number of GL contexts lost by the panels.
-    """
+    """Start a solver's process, which is replaced when `contexts_lost` changes."""
 
     def setup(known: Known) -> SolverSetup:
         if known.facts is None:

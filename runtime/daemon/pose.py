@@ -25,13 +25,9 @@ CHANNELS = {"x": "cm", "y": "cm", "z": "cm", "yaw": "degrees", "pitch": "degrees
 
 
 def pose_of(eyes_m: Eyes, origin_m: tuple[float, float, float]) -> F64:
-    """Return the head's pose (6,): x, y and z in centimetres, and yaw, pitch and roll in degrees.
-
+    """Return the head's pose (6,): x, y and z in cm from `origin_m`, and yaw, pitch and roll in degrees.
     Seen by the viewer, x is to the right, y up and z towards the display. Yaw is positive to the right, and roll is
     positive if the head leans to its right shoulder. Pitch is 0, because two eyes do not show it.
-
-    Args:
-        origin_m: Position of the midpoint between the eyes at which x, y and z are 0.
     """
     out, right, up = eyes_m.mean(0) - origin_m
     backwards, sideways, upwards = eyes_m[1] - eyes_m[0]
@@ -44,9 +40,8 @@ class PoseSender:
     """Observer of the loop that sends the pose of a tracked viewer."""
 
     def __init__(self, settings: PoseSettings) -> None:
-        """Open the socket and the LSL stream.
-
-        Raises InputError if the host's name is unknown, and MissingPart if LSL is wanted but not installed.
+        """Open the socket and the LSL stream. Raises InputError if the host's name is unknown, and MissingPart if LSL
+        is wanted but not installed.
         """
         self._settings = settings
         self._stream = _lsl_stream(settings) if settings.lsl else None
