@@ -26,10 +26,7 @@ WORTH = 0.995  # refine only if the expected error would fall below this share o
 
 @dataclass(frozen=True, slots=True)
 class Slots:
-    """Refreshes at which a solution will be shown, given when it begins.
-
-    A refresh shows the latest solution that is complete when the refresh is composed.
-    """
+    """Refreshes that show a solution, given when it begins: each shows the latest complete one."""
 
     photon_ns: int  # current refresh's display time
     composed_ns: int  # when the current refresh was composed
@@ -37,10 +34,7 @@ class Slots:
     period_ns: int
 
     def middle_ns(self, cost_ns: int) -> int:
-        """Return the middle of the display times of a solution that takes `cost_ns`.
-
-        The next solution is assumed to begin when this one is complete, and to take as long.
-        """
+        """Return the middle of the display times of a solution that takes `cost_ns`, as long as the next."""
         first = max(self._refresh_after(cost_ns), 1)  # the current refresh is already composed
         end = max(self._refresh_after(2 * cost_ns), first + 1)
         return self.photon_ns + self.period_ns * (first + end - 1) // 2
@@ -51,21 +45,10 @@ class Slots:
 
 
 class Aim:
-    """Builds solver requests during one run.
-
-    Not thread-safe. Never reads a clock.
-    """
+    """Builds solver requests during one run. Not thread-safe. Never reads a clock."""
 
     def __init__(self, viewer: Viewer, solver: SolverHost, *, period_ns: int, fixed: Effort | None = None) -> None:
-        """Create an aim for one run.
-
-        Args:
-            viewer: Source of the predicted eyes.
-            solver: Source of the measured solution costs.
-            period_ns: The display's refresh period.
-            fixed: Effort to use for every solution if `model.effort` is `full`. None means all steps on the full
-                raster.
-        """
+        """Create an aim for one run. `fixed` is the effort if `model.effort` is `full`, by default all steps."""
         self._viewer, self._solver, self._period_ns, self._fixed = viewer, solver, period_ns, fixed
         self._chooser = EffortChooser()
         self._calm_ns: int | None = None  # when the head's speed fell below CALM_M_S
@@ -146,9 +129,8 @@ class Aim:
             self._chooser.pictures.learn(shown.measures, shown.effort)
 
     def _eyes_then(self, slots: Slots, eyes: EyesEstimate, *, cost_ns: int) -> tuple[int, F64 | None, EyesLabel]:
-        """Return the time to solve for, the eyes (2, 3) predicted for that time, and their label.
-
-        The eyes are predicted at most `HORIZON_NS` beyond the display time.
+        """Return the time to solve for, the eyes (2, 3) predicted for that time, and their label. The eyes are
+        predicted at most `HORIZON_NS` beyond the display time.
         """
         middle_ns = slots.middle_ns(cost_ns)
         reach_ns = min(middle_ns, slots.photon_ns + HORIZON_NS)
@@ -185,9 +167,8 @@ class Aim:
         return outlook
 
     def _horizon_s(self, timing: FrameTiming, *, speed_m_s: float) -> float:
-        """Return how long the head is expected to keep moving as it does now, in seconds.
-
-        A calm head is expected to stay calm for as long as it has already been calm, and for `HORIZON_S` more.
+        """Return how long the head is expected to keep moving as it does now, in seconds. A calm head is expected to
+        stay calm for as long as it has already been calm, and for `HORIZON_S` more.
         """
         if speed_m_s > CALM_M_S:
             self._calm_ns = None
@@ -197,10 +178,7 @@ class Aim:
         return HORIZON_S + (timing.photon_ns - self._calm_ns) / NS_PER_S
 
     def _usual_speed_m_s(self, moved_m: float, eyes: EyesEstimate) -> float:
-        """Return the larger of the head's current speed and the RMS of its recent speed.
-
-        The RMS is needed at turning points, where the current speed is zero, and while the eyes are lost.
-        """
+        """Return the larger of the head's current speed and its recent RMS, for turning points and lost eyes."""
         speed_m_s = moved_m * NS_PER_S / self._period_ns
         if eyes.label != "held":
             gain = self._period_ns / (self._period_ns + SPEED_NS)
@@ -219,15 +197,7 @@ class Aim:
     def _refined(
         self, shown: Solution, most: int, costs: Costs, *, shown_error: float, horizon_s: float
     ) -> Effort | None:
-        """Return the effort to refine a resting head's solution to, or None to keep the solution as it is.
-
-        Args:
-            shown: The solution to refine.
-            most: Largest total number of steps that the solution can be continued to.
-            costs: Solution costs.
-            shown_error: Squared error expected from the solution now shown.
-            horizon_s: How long the head is expected to stay at rest, in seconds.
-        """
+        """Return the effort, of at most `most` steps, to refine a resting head's solution to, or None to keep it."""
         done, pictures = shown.effort, self._chooser.pictures
         if done is None:
             return None

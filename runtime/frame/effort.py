@@ -92,11 +92,7 @@ class CostBook:
     """
 
     def __init__(self, first: Mapping[int, Mapping[str, float]]) -> None:
-        """Create a cost book with initial times.
-
-        Args:
-            first: Time in milliseconds, keyed by reduction and then stage, measured before the first refresh.
-        """
+        """Create a cost book with times in ms, by reduction and stage, measured before the first refresh."""
         self.first = first
         self._measured: dict[int, dict[str, float]] = {}
         self._unused: dict[int, int] = {}  # solutions on other rasters since this one's last use, by reduction
@@ -163,32 +159,22 @@ class Outlook:
     lag_m: float = 0.0  # how far the head moves beyond the tracker's prediction horizon
 
     def moved_m2(self, spread_s: float) -> float:
-        """Return the mean squared distance from a solution's eyes to the true eyes, in m².
-
-        Args:
-            spread_s: RMS deviation of the solution's display times from their middle, in seconds (`display_spread_s`).
-        """
+        """Return the mean squared distance from a solution's eyes to the true eyes, in m²."""
         return 2 * self.sigma_m**2 + (self.speed_m_s * spread_s) ** 2 + self.lag_m**2
 
 
 def display_spread_s(cost_ms: float, *, period_ms: float) -> float:
-    """Return the RMS deviation, from their middle, of the display times of a solution, in seconds.
-
-    The display times of n refreshes deviate by the period times sqrt((n² - 1)/12). A solution is shown at one refresh
-    at least, and otherwise at as many as fit in the time taken by the next solution.
-
-    Args:
-        cost_ms: Time taken by a solution.
-        period_ms: The display's refresh period.
+    """Return the RMS deviation, from their middle, of the display times of a solution, in seconds. Those
+    of n refreshes deviate by the period times sqrt((n² - 1)/12). A solution is shown at one refresh at least, and
+    otherwise at as many as fit in the time taken by the next one.
     """
     return float(max(cost_ms**2 - period_ms**2, 0.0) ** 0.5) / 12**0.5 / 1e3
 
 
 @dataclass(slots=True)
 class Foresight:
-    """Estimates the ratio of observed to expected squared eye displacement.
-
-    A displacement is the distance from the eyes that a solution was computed for to the true eyes while it is shown.
+    """Estimates the ratio of observed to expected squared eye displacement. A displacement is the
+    distance from the eyes that a solution was computed for to the true eyes while it is shown.
     """
 
     scale: float = 1.0
@@ -284,15 +270,9 @@ class EffortChooser:
         period_ms: float,
         horizon_s: float = HORIZON_S,
     ) -> Effort:
-        """Return the effort with the lowest mean error over the horizon.
-
-        Args:
-            efforts: Efforts to choose from.
-            costs: Solution costs.
-            outlook: Function that maps a solution's cost in milliseconds to its outlook.
-            shown_error: Squared error expected from the solution now shown.
-            period_ms: The display's refresh period.
-            horizon_s: How long head and content are assumed to continue as they are, in seconds.
+        """Return the effort with the lowest mean error over the horizon. `outlook` maps a solution's cost in
+        ms to its outlook; `shown_error` is the squared error expected from the solution now shown; `horizon_s` is how
+        long head and content are assumed to continue as they are.
         """
         means: dict[Effort, float] = {}
         for effort in efforts:
@@ -309,22 +289,14 @@ class EffortChooser:
         return best
 
     def mean_error(self, error: float, cost_ms: float, *, shown_error: float, horizon_s: float) -> float:
-        """Return the mean error over the horizon for a solution started now.
-
-        The error is `shown_error` until the solution is complete, and `error` after that. If the head starts moving
-        before the solution is complete, the viewer sees an outdated view until then. The probability of this is c/H,
-        and it lasts c/2 on average.
+        """Return the mean error over the horizon for a solution started now. The error is `shown_error` until
+        the solution is complete, and `error` after that. If the head starts moving before the solution is complete, the
+        viewer sees an outdated view until then. The probability of this is c/H, and it lasts c/2 on average.
         """
         waited = min(cost_ms / 1e3 / horizon_s, 0.9)
         return waited * shown_error + (1 - waited) * error + waited**2 / 2 * self.pictures.contrast
 
     def expected_error(self, effort: Effort, outlook: Outlook, *, spread_s: float) -> float:
-        """Return J, the mean squared light error while a solution is shown.
-
-        Args:
-            effort: The solution's effort.
-            outlook: Expected accuracy of its eyes.
-            spread_s: RMS deviation of its display times from their middle, in seconds.
-        """
+        """Return J, the mean squared light error while a solution is shown, for `display_spread_s`."""
         moved_m = (self.foresight.scale * outlook.moved_m2(spread_s)) ** 0.5
         return self.pictures.own(effort) + self.pictures.stale(moved_m, spread_s)

@@ -31,20 +31,10 @@ class Output(Protocol):
         """Append a line to frames.jsonl."""
 
     def light(self, frame: int, *, layers: U8) -> None:
-        """Write the layers shown by the panels at one refresh.
-
-        Args:
-            layers: (N, h, w, 4) RGBA layers, rear to front.
-        """
+        """Write the RGBA layers (N, h, w, 4) shown by the panels at one refresh."""
 
     def light_targets(self, frame: int, *, info: dict[str, Any], drawn: Pictures | None, true: Pictures | None) -> None:
-        """Write the target pictures for a refresh whose layers were saved.
-
-        Args:
-            info: Eye positions, and the pictures' field of view.
-            drawn: Pictures for the eye positions used to compute the solution.
-            true: Pictures for the true eye positions.
-        """
+        """Write the target pictures for the eyes solved for and the true eyes of a refresh with saved layers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,10 +45,7 @@ class _Kept:
 
 
 class KeptLight:
-    """Writes every `every`-th refresh's layers and target pictures.
-
-    If `every` is 0, nothing is written.
-    """
+    """Writes every `every`-th refresh's layers and target pictures, or none if it is 0."""
 
     def __init__(self, every: int, output: Output, drawer: TargetDrawer, truth: TrueEyes, *, simulated: bool) -> None:
         self._every, self._output, self._drawer, self._truth = every, output, drawer, truth
@@ -67,11 +54,7 @@ class KeptLight:
         self._kept: list[_Kept] = []
 
     def refreshed(self, refresh: Refresh) -> None:
-        """Write this refresh's layers if it is due.
-
-        In real time, a background job writes the layers, and any refresh that comes due while the job is still running
-        is skipped.
-        """
+        """Write this refresh's layers if due; in real time, by a background job, and not while it is running."""
         account = refresh.account
         if not self._every or account.frame % self._every != self._every - 1 or not account.presented:
             return
@@ -93,12 +76,7 @@ class KeptLight:
             self._draw(kept, lambda: None)
 
     def finish(self, stopped: Callable[[], bool]) -> None:
-        """When playing a recording, draw the target pictures for all saved refreshes.
-
-        Args:
-            stopped: Function that returns True once a stop has been requested. The remaining refreshes are then written
-                without target pictures.
-        """
+        """When playing a recording, draw the target pictures for all saved refreshes, until `stopped`."""
         if self._job is not None:
             self._job.wait(WRITTEN_WITHIN_S)
         total = len(self._kept)

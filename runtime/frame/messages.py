@@ -22,10 +22,7 @@ Wanted = Mapping[str, tuple[F64, int]]  # eyes (2, 3) in frame `stack` and a tim
 
 @dataclass(frozen=True, slots=True)
 class ChangeSettings:
-    """Order to load what other settings ask for, and then to use it instead.
-
-    Answered by `Progress`, then `Done`.
-    """
+    """Order to load what other settings request, and then use it. Answered by `Progress`, then `Done`."""
 
     settings: Settings
     reload_content: bool = False  # load the content even if its settings are the same

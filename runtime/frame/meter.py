@@ -1,6 +1,5 @@
-"""Measure each solution's error, lost detail and rate of change on a sample of its pixels.
-
-All measurements run on the solver's thread.
+"""Measure each solution's error, lost detail and rate of change at some pixels, on the solver's
+thread.
 """
 
 from __future__ import annotations
@@ -40,13 +39,7 @@ class SolutionMeter:
         self._places = np.random.default_rng(1).random((2, RAYS, 2))
 
     def measure(self, job: Job, layers: U8, effort: Effort, *, time_ns: int) -> Measures | None:
-        """Measure one solution. Returns None if its pictures exist only as textures.
-
-        Args:
-            layers: The solution's layers, shape (N, h, w, 4).
-            effort: The solution's effort.
-            time_ns: Time that the pictures were drawn for.
-        """
+        """Measure one solution's layers, drawn for `time_ns`, or return None if its pictures are textures."""
         if any(isinstance(view.picture, DrawnPicture) for view in job.views):
             return None
         key = Effort(effort.reduction, effort.steps)
@@ -64,9 +57,8 @@ class SolutionMeter:
         )
 
     def _change(self, job: Job, *, time_ns: int) -> tuple[float, float, float] | None:
-        """Return `Measures.change`, or None if the change is not measured for this solution.
-
-        Of every `EVERY` solutions, one has its pictures copied and compared with the next solution's pictures.
+        """Return `Measures.change`, or None if it is not measured for this solution. Of every `EVERY` solutions, one
+        has its pictures copied and compared with the next solution's pictures.
         """
         turn, self._solutions = self._solutions % EVERY, self._solutions + 1
         before, self._before = self._before, None
@@ -91,17 +83,12 @@ class SolutionMeter:
 def sampled_light(layers: U8, job: Job, places: F64, *, boxes: bool) -> float | None:
     """Return the squared error of the light, measured at sampled pixels in both pictures.
 
-    Two rays are traced through each sampled pixel, and their errors are multiplied. Because both rays go through the
-    same pixel, the mean of these products is unbiased (docs/contracts.md: light). A pair is ignored if either ray
-    misses a panel. Returns None if no pair is left.
+    Two rays are traced through each sampled pixel, and their errors are multiplied, so that the mean is unbiased
+    (docs/contracts.md: light). A pair is ignored if either ray misses a panel; None if no pair is left.
 
-    Args:
-        layers: Layers on the job's raster, shape (N, h, w, 4).
-        places: Uniform random numbers in [0, 1), shape (2, K, 2). `places[0]` selects the K pixels, as fractions of the
-            picture's width and height. The remainders of all numbers modulo 1/64 determine where the two rays lie
-            within their pixel.
-        boxes: True to treat each panel pixel as a uniform square. False for a coarse solution, which is enlarged
-            bilinearly.
+    `places` are uniform numbers in [0, 1), shape (2, K, 2): `places[0]` selects the K pixels, as fractions of the
+    picture's size, and all remainders modulo 1/64 the rays' positions within their pixel. Panel pixels are squares if
+    `boxes`, or else, in a coarse solution, enlarged bilinearly.
     """
     eyes = zip(job.eyes_m, job.views, strict=True)
     product = np.concatenate([_products(layers, job.stack, eye_m, view, places, boxes=boxes) for eye_m, view in eyes])

@@ -18,10 +18,7 @@ from runtime.records import RefreshAccount, SensorFrame
 
 
 class RunObserver:
-    """Records and measures a run's refreshes.
-
-    The presenter passes on every sample and refresh. After the run, `finish` completes the records.
-    """
+    """Records and measures a run's samples and refreshes; after the run, `finish` completes the records."""
 
     def __init__(
         self,
@@ -35,17 +32,9 @@ class RunObserver:
         simulated: bool = False,
         newest: bool = False,
     ) -> None:
-        """Create an observer for one run.
-
-        Args:
-            drawer: Draws the target pictures.
-            evaluate_every: Measure the quality of every `evaluate_every`-th refresh and of the last one. If 0, measure
-                only the last refresh. If None, measure nothing.
-            keep_light: Save the layers of every `keep_light`-th refresh. If 0, save no layers.
-            output: Destination for the run's files. If None, no files are written.
-            on_account: Function called with each refresh's account.
-            simulated: True if the run's clock is simulated.
-            newest: Measure the newest refresh whenever its light is not known, instead of every `evaluate_every`-th.
+        """Create an observer for one run, whose files go to `output`. Quality is measured at every `evaluate_every`-th
+        refresh and the last one, only the last if 0, none if None, or with `newest` whenever the newest refresh's light
+        is unknown. Every `keep_light`-th refresh's layers are saved.
         """
         self._measures, self._simulated, self._on_account = evaluate_every is not None, simulated, on_account
         self.last: Refresh | None = None
@@ -91,13 +80,9 @@ class RunObserver:
         self._sampler.advance()
 
     def finish(self, stopped: Callable[[], bool] = lambda: False) -> None:
-        """Complete the run's records after its last refresh.
-
-        All queued refreshes are written and measured, and target pictures are drawn for each refresh whose layers were
-        saved. The last refresh is also measured, but in real time only if no other refresh has been measured.
-
-        Args:
-            stopped: Function that returns True once a stop has been requested. Any remaining work is then skipped.
+        """Complete the run's records after its last refresh, until `stopped`. All queued refreshes are
+        written and measured, and target pictures are drawn for each refresh whose layers were saved. The last refresh
+        is also measured, but in real time only if no other refresh has been measured.
         """
         self.truth.end()
         self._lines.advance()

@@ -21,10 +21,7 @@ Kind = Literal["solve", "refine", "flat", "nothing"]
 
 @dataclass(frozen=True, slots=True)
 class SolutionKey:
-    """The inputs used for the latest solution or flat picture.
-
-    The result is outdated if the current inputs differ from those in its key.
-    """
+    """The inputs of the latest solution or flat picture, which is outdated if they change."""
 
     state_version: int
     revision: int  # content revision
@@ -59,15 +56,8 @@ class FramePolicy:
         solved: SolutionKey | None,
         flat: SolutionKey | None,
     ) -> Decision:
-        """Decide what the solver should do next.
-
-        Args:
-            request: The latest request.
-            plan: Savings to apply. None if no plan has been made.
-            state_version: Version of the run's current state.
-            revision: The content's revision at `request.time_ns`.
-            solved: The latest solution's key, or None if there is none.
-            flat: The latest flat picture's key, or None if there is none.
+        """Decide what to do next for a request, given the run's and the content's versions and existing
+        results.
         """
         if request.flat_wanted and not self._flat_wanted:
             self.episode += 1
@@ -92,10 +82,7 @@ class FramePolicy:
     def _eyes_to_solve(
         self, request: SolveRequest, plan: Plan | None, *, state_version: int, revision: int, solved: SolutionKey | None
     ) -> F64 | None:
-        """Choose the eyes (2, 3) to solve for.
-
-        Returns None if the latest solution is still valid or if no eyes are known.
-        """
+        """Choose the eyes (2, 3) to solve for, or None if the latest solution is still valid or no eyes are known."""
         if request.eyes_m is None:
             return None
         eyes_m = request.eyes_m if plan is None else selected_eyes(request.eyes_m, plan.eyes)
@@ -106,10 +93,9 @@ class FramePolicy:
 
 
 def _is_more(effort: Effort | None, done: Effort | None) -> bool:
-    """Return True if `effort` uses a finer raster than `done`, or more steps on the same raster.
-
-    An effort that continues a solution is no more than one on another raster, because it was chosen for a solution
-    that has been replaced since, and the new solution's pictures are too coarse to continue with.
+    """Return True if `effort` uses a finer raster than `done`, or more steps on the same raster. An effort that
+    continues a solution is no more than one on another raster, because it was chosen for a solution that has been
+    replaced since, and the new solution's pictures are too coarse to continue with.
     """
     if effort is None or done is None:
         return False

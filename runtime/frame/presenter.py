@@ -51,10 +51,7 @@ log = logging.getLogger("phasestack.presenter")
 
 
 class Supervisor:
-    """Hooks that let the daemon control the presenter.
-
-    Each hook is called once per refresh and must not block.
-    """
+    """Hooks that let the daemon control the presenter, called once per refresh, which must not block."""
 
     def stop_reason(self) -> str:
         """Return the reason to stop, or an empty string to continue."""
@@ -78,10 +75,7 @@ class Refresh:
 
 
 class Observer(Protocol):
-    """Receives samples and refreshes.
-
-    The methods are called during each refresh, so they must return quickly.
-    """
+    """Receives samples and refreshes, during each refresh, so its methods must return quickly."""
 
     def sampled(self, sample: SensorFrame) -> None:
         """Handle a sample that has arrived."""
@@ -91,10 +85,7 @@ class Observer(Protocol):
 
 
 class RefreshTimes:
-    """Measures how long each stage of a refresh takes.
-
-    On a simulated clock, each stage takes the configured time, and the clock is advanced by that time.
-    """
+    """Measures each stage of a refresh, or advances a simulated clock by the configured time."""
 
     def __init__(self, clock: Clock, simulated_ms: Mapping[str, float]) -> None:
         self._simulated = clock if isinstance(clock, SimulatedClock) else None
@@ -124,19 +115,13 @@ class RefreshTimes:
         self.stage_ms["wait"] = self.stage_ms.get("wait", 0.0) + held_ns / NS_PER_MS
 
     def overhead_ms(self) -> float:
-        """Return how long the refresh has taken on the machine's clock, in milliseconds.
-
-        Time spent presenting and waiting is not included.
-        """
+        """Return the refresh's time on the machine's clock in ms, without presenting and waiting."""
         whole_ms = (perf_counter_ns() - self._start_ns) / NS_PER_MS
         return max(0.0, whole_ms - sum(self._watch.stage_ms.get(stage, 0.0) for stage in ("present", "wait")))
 
 
 class Presenter:
-    """Runs a run's refresh loop.
-
-    All parts passed to the constructor belong to the caller, who must close them.
-    """
+    """Runs a run's refresh loop. All parts passed to the constructor belong to the caller."""
 
     def __init__(
         self,
@@ -154,20 +139,8 @@ class Presenter:
         observers: Sequence[Observer] = (),
         fixed: Effort | None = None,
     ) -> None:
-        """Create a presenter.
-
-        Args:
-            state: The first settings and calibration.
-            pacer: Schedules the refreshes.
-            samples: Source of samples.
-            viewer: Estimates the viewer's eyes from the samples.
-            solver: Runs the solver.
-            panels: Panels to present on.
-            stage_ms: Duration of each stage of a refresh on a simulated clock, in milliseconds.
-            supervisor: The daemon's hooks.
-            observers: Objects that receive all samples and refreshes.
-            fixed: Effort to use for every solution if `model.effort` is `full`. None means all steps on the full
-                raster.
+        """Create a presenter, whose stages take `stage_ms` on a simulated clock. `fixed` is the effort if
+        `model.effort` is `full`, by default all steps on the full raster.
         """
         self.state, self.stack, self.clock = state, stack, clock
         self.pacer, self.samples, self.viewer, self.solver, self.panels = pacer, samples, viewer, solver, panels
@@ -189,10 +162,7 @@ class Presenter:
         self._aligned: tuple[int, bytes, Alignment] | None = None  # number of the solution, eyes, alignment
 
     def run(self, *, frames: int | None = None) -> str:
-        """Refresh the panels until the run ends, and return the reason for ending.
-
-        The run ends once the recording has ended, `frames` refreshes have been done, or a stop has been requested.
-        """
+        """Refresh the panels until `frames`, the recording's end, or a stop, and return the reason."""
         reason = ""
         while not reason:
             try:
@@ -206,12 +176,7 @@ class Presenter:
         return reason
 
     def refresh(self) -> RefreshAccount:
-        """Carry out one refresh and return its account.
-
-        Raises:
-            EndOfRecording: The recording that replaces the sensor has ended.
-            FatalError: The sensor has failed permanently.
-        """
+        """Carry out one refresh. Raises EndOfRecording, or FatalError if the sensor has failed permanently."""
         times = RefreshTimes(self.clock, self._stage_ms)
         timing = self.pacer.predict(self.clock.now_ns())
         self.clock.sleep_until_ns(timing.wake_ns)
@@ -268,10 +233,7 @@ class Presenter:
                 observer.sampled(sample)
 
     def _compose(self, timing: FrameTiming, eyes: EyesEstimate, news: SolverUpdate) -> tuple[PanelFrame, str]:
-        """Return the frame to present, and the reason if the alignment has reached a limit.
-
-        The reason is "" if it has not.
-        """
+        """Return the frame to present, and the reason if the alignment has reached a limit, otherwise ""."""
         solution, flat = news.solution, news.flat
         target = 1.0 if eyes.eyes_m is None or self.flat_asked else 0.0
         if solution is None:
@@ -300,10 +262,8 @@ class Presenter:
         return frame, alignment.limited
 
     def _alignment(self, eyes: EyesEstimate, solution: Solution | None) -> Alignment:
-        """Align the solution to the eyes.
-
-        If no eyes are known, the same solution's previous alignment is returned. If the layers are shown as solved, the
-        alignment contains no matrices.
+        """Align the solution to the eyes, or return its previous alignment if no eyes are known. If the layers are
+        shown as solved, the alignment contains no matrices.
         """
         plan = self.state.settings.plan
         if solution is None or solution.solved_for_m is None or not plan.align:
@@ -419,11 +379,7 @@ class Presenter:
             observer.refreshed(self.last)
 
     def summary(self, *, simulated: bool = False) -> dict[str, Any]:
-        """Return the counts, times, model and states for summary.json (docs/contracts.md).
-
-        Args:
-            simulated: True if the run's clock is simulated.
-        """
+        """Return the counts, times, model and states for summary.json (docs/contracts.md)."""
         facts = self.solver.facts
         return {
             **self.stats.summary(stale_inputs=self.samples.stale_inputs, simulated=simulated),

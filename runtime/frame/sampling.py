@@ -48,9 +48,8 @@ class _Sample:
 
 
 class QualitySampler:
-    """Measures the quality of every `every`-th refresh and, if `finish` is called, of the last one.
-
-    If `every` is 0, only the last refresh is measured. If `newest` is true, light is instead measured at the newest
+    """Measures the quality of every `every`-th refresh and, if `finish` is called, of the last one. If
+    `every` is 0, only the last refresh is measured. If `newest` is true, light is instead measured at the newest
     refresh whenever the eyes, the content or the model have changed since the last measurement.
     """
 
@@ -82,10 +81,7 @@ class QualitySampler:
         self._began_s = self._resumes_s = 0.0  # when the latest measurement began, and when the next may begin
 
     def refreshed(self, refresh: Refresh) -> None:
-        """Queue a refresh if it is due.
-
-        In real time, if the queue is then too large, earlier refreshes are dropped from it.
-        """
+        """Queue a refresh if it is due; in real time, drop earlier ones from a queue that is too large."""
         if self._newest:
             self._replace_waiting(refresh)
             return
@@ -136,11 +132,7 @@ class QualitySampler:
         return bool(self._waiting) or self._drawing or self._job is not None
 
     def drain(self, stopped: Callable[[], bool]) -> None:
-        """Measure the queued refreshes after the run.
-
-        Args:
-            stopped: Function polled during the wait. Once it returns True, no further measurement is started.
-        """
+        """Measure the queued refreshes after the run, until `stopped`."""
         ends_s = time.monotonic() + MEASURED_WITHIN_S
         self._collect()
         while self._is_busy and not stopped() and time.monotonic() < ends_s:
@@ -150,11 +142,8 @@ class QualitySampler:
                 time.sleep(LOOK_S)
 
     def advance(self, *, at_once: bool = False) -> None:
-        """Collect a finished measurement, and measure queued refreshes if their true eyes are now known.
-
-        Args:
-            at_once: Start the next measurement now, even if measuring then takes more than `MEASURING_SHARE` of the
-                run.
+        """Collect a finished measurement, and measure queued refreshes whose true eyes are known. `at_once`:
+        even if measuring takes more than `MEASURING_SHARE` of the run.
         """
         self._collect()
         now_s = time.monotonic()
@@ -179,9 +168,8 @@ class QualitySampler:
             self._resumes_s = now_s + (now_s - self._began_s) * (1 / share - 1)
 
     def finish(self, last: Refresh) -> None:
-        """Measure the run's last refresh.
-
-        The result counts towards the means only if no other refresh has been measured.
+        """Measure the run's last refresh. The result counts towards the means only if no other refresh has
+        been measured.
         """
         drawn: list[RefreshTargets | None] = []
         true_m = self._truth.at(last.account.photon_ns)

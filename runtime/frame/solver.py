@@ -32,10 +32,7 @@ FLAT_EYE_M = (0.7, 0.0, 0.0)  # the flat picture's viewpoint until a viewer has 
 
 
 class Solver:
-    """Computes at most one solution or flat picture in each step.
-
-    Each step uses the state as it was when the step began.
-    """
+    """Computes at most one solution or flat picture in each step, with the state at its beginning."""
 
     def __init__(self, run: SceneCell, stack: PanelStack, *, timed: bool = True) -> None:
         """Create a solver.
@@ -60,16 +57,9 @@ class Solver:
         self._missing: dict[str, str] = {}
 
     def step(self, request: SolveRequest, state: SceneState | None = None) -> SolverUpdate:
-        """Carry out a request and return the results.
-
-        If the content or the model fails, the update names the failed part, and all earlier results remain valid.
-
-        Args:
-            request: The request to carry out.
-            state: The state to use for drawing and solving. None means the latest state.
-
-        Raises:
-            ContextLost: The GL context was lost, so this solver can no longer be used.
+        """Carry out a request, with the latest state unless given, and return the results. If the content or
+        the model fails, the update names the failed part, and all earlier results remain valid. Raises ContextLost,
+        after which this solver can no longer be used.
         """
         state = state or self.run.state
         self._replan(state, request.eyes_m)
@@ -101,16 +91,8 @@ class Solver:
         return SolverUpdate(missing=dict(self._missing))
 
     def trial_ms(self, eyes_m: Eyes, reduction: int, *, time_ns: int) -> dict[str, float]:
-        """Draw and solve once in one step, discard the result, and return the stage times in milliseconds.
-
-        Args:
-            reduction: Number to divide the panels' rows and columns by.
-            time_ns: Instant to draw the content at.
-
-        Raises:
-            ContentFailure: The content could not be drawn.
-            ContextLost: The GL context was lost, so this solver can no longer be used.
-            ModelFailure: Inference failed or returned numbers that are not finite.
+        """Draw and solve once in one step, discard the result, and return the stage times in ms. Raises
+        ContentFailure, ModelFailure, or ContextLost, after which this solver can no longer be used.
         """
         state, watch = self.run.state, Stopwatch()
         plan = state.settings.plan
@@ -179,9 +161,8 @@ class Solver:
         return SolverUpdate(solution=solution)
 
     def _drawn(self, state: SceneState, request: SolveRequest, eyes_m: Eyes, reduction: int) -> Job:
-        """Draw a solution's target pictures.
-
-        If the head is at rest, the pictures are also copied, because the solution may be refined later.
+        """Draw a solution's target pictures. If the head is at rest, the pictures are also copied, because the solution
+        may be refined later.
         """
         job = drawn_job(
             state.predictor,

@@ -38,10 +38,7 @@ class SolverParts(Protocol):
         """Return the solution costs that apply on a simulated clock with the current settings."""
 
     def first_costs(self, *, time_ns: int) -> Mapping[int, Mapping[str, float]]:
-        """Return the times of solutions in milliseconds, keyed by reduction and then stage.
-
-        They are measured at the first call and whenever the model has changed, with the content as it is at `time_ns`.
-        """
+        """Return solution times in ms, by reduction and stage, measured first and after changes of the model."""
 
     def close(self) -> None:
         """Release all resources."""
@@ -51,11 +48,8 @@ Then = Callable[[Answer], None]
 
 
 class SolverHost(ABC):
-    """Base class for hosts, which run a solver on the presenter's behalf.
-
-    For use on the presenter's thread.
-
-    The presenter posts requests, sends orders and reads results. None of these waits for the solver.
+    """Base class for hosts, which run a solver on the presenter's behalf, and on its thread only. The
+    presenter posts requests, sends orders and reads results. None of these waits for the solver.
     """
 
     restarts = 0  # how many solvers have been replaced
@@ -89,28 +83,18 @@ class SolverHost(ABC):
 
     @abstractmethod
     def news(self) -> SolverUpdate:
-        """Return the latest complete solution and flat picture, and the parts that have failed.
-
-        Before it returns, it passes on all answers that have arrived.
-        """
+        """Pass on all answers, and return the latest solution and flat picture, and the failed parts."""
 
     def send(self, order: Order, then: Then = lambda answer: None) -> int:
-        """Send an order and return its number.
-
-        Args:
-            order: Order without a number.
-            then: Function called with each answer, on this thread, by `news`.
-        """
+        """Send an order without a number, and return its number. `news` calls `then` with each answer."""
         self._sent += 1
         self._waiting[self._sent] = then
         self._dispatch(replace(order, number=self._sent))
         return self._sent
 
     def restart(self, reason: str) -> None:  # noqa: B027 - a solver in this process cannot be ended
-        """Replace the solver, if it runs in its own process.
-
-        Args:
-            reason: What to report, such as `was ended because it took too long`.
+        """Replace the solver, if it runs in its own process. A reason is `was ended because it took too
+        long`.
         """
 
     def status(self) -> list[dict[str, Any]]:
@@ -138,10 +122,8 @@ def taken_in(news: SolverUpdate, step: SolverUpdate) -> SolverUpdate:
 
 
 class SimulatedSolver(SolverHost):
-    """Runs a solver on a simulated clock.
-
-    Computes each request immediately, but publishes the result only once the simulated clock has advanced by the
-    solution's configured cost.
+    """Runs a solver on a simulated clock. Computes each request immediately, but publishes the result
+    only once the simulated clock has advanced by the solution's configured cost.
     """
 
     def __init__(self, parts: SolverParts, clock: Clock) -> None:
