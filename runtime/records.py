@@ -98,9 +98,10 @@ class EyesEstimate:
 
     time_ns: int  # instant that the estimate is for
     capture_ns: int  # capture time of the newest sample used; may be 0 with label `none`
-    eyes_m: F64 | None  # (2, 3) left and right eye in metres, in frame `stack`; None with label `none`
+    eyes_m: F64 | None  # (2P, 3) left and right eye of each person in metres, in frame `stack`; None with label `none`
     label: EyesLabel
     sigma_m: float = 0.0  # standard deviation, along each axis, of the eyes' midpoint at `time_ns`
+    people: tuple[int, ...] = ()  # number of each person in `eyes_m`
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,13 +171,14 @@ class SolveRequest:
     """A request from the presenter to the solver. It replaces any request that the solver has not begun."""
 
     time_ns: int  # instant to solve for, the middle of the solution's expected display time
-    eyes_m: F64 | None  # (2, 3) left and right eye in metres, in frame `stack`, at `time_ns`; None: no viewer
+    eyes_m: F64 | None  # (2P, 3) eyes of all people served, in metres, in frame `stack`, at `time_ns`; None: no viewer
     eyes_label: EyesLabel
     sigma_m: float  # standard deviation of `eyes_m` along each axis
     flat_wanted: bool  # True if the flat picture is shown or will be needed
     paused: bool = False  # True if no new solutions are wanted
     effort: Effort | None = None  # effort for a new solution; None: full effort
     refined_to: Effort | None = None  # effort to refine an unchanged solution to; None: do not refine
+    people: tuple[int, ...] = (1,)  # number of each person in `eyes_m`
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,15 +212,26 @@ class Solution:
 
     number: int  # counted from 1, over solutions and flat pictures together
     layers: U8  # (N, h, w, 4) RGBA layers, rear to front, on a raster that is coarser by `effort.reduction`
-    solved_for_m: F64 | None  # (2, 3) left and right eye in metres, in frame `stack`; None: a flat picture
+    solved_for_m: F64 | None  # (2P, 3) all people's eyes in metres, in frame `stack`; None: a flat picture
     solved_for_ns: int  # instant that the eyes and the content were predicted for
-    seeing: tuple[bool, bool] = (True, True)  # left, right; False: eye out of range, replaced by the other eye
+    seeing: tuple[bool, ...] = (True, True)  # for each eye; False: out of range, replaced by the person's other eye
     eye_sigma_m: float | None = None  # tracking error that the solution allows for
     stage_ms: dict[str, float] = field(default_factory=dict)  # time of each of `SOLVING_STAGES`, on the run's clock
     effort: Effort | None = None  # None: a flat picture
     measures: Measures | None = None
     relief: F32 | None = None  # (h, w) relief of the content on the middle panel (`optics.relief`); None: unknown
     state_version: int = 0  # the solver's state that it was computed with (`Facts.version`)
+    people: tuple[int, ...] = (1,)  # number of each person in `solved_for_m`
+
+
+@dataclass(frozen=True, slots=True)
+class PersonAccount:
+    """One person's part in a refresh. Positions are (2, 3), left and right eye, in metres, in frame `stack`."""
+
+    number: int  # counted from 1, in the order in which people came into view
+    eyes_m: F64  # eyes that the panels are aligned to, as far as people have moved alike
+    solved_for_m: F64 | None  # eyes that the solution was computed for; None: it was computed without this person
+    true_eyes_m: F64 | None = None  # true eyes at the display time, from recordings with ground truth
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,3 +256,4 @@ class RefreshAccount:
     true_eyes_m: F64 | None = None  # (2, 3) true eyes at the display time, from recordings with ground truth
     stage_ms: dict[str, float] = field(default_factory=dict)  # time taken by each stage, on the run's clock
     effort: str | None = None  # name of the shown solution's effort (`Effort.name`)
+    people: tuple[PersonAccount, ...] = ()  # everybody who is served; the fields above describe the first

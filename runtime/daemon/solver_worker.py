@@ -11,7 +11,7 @@ import numpy as np
 
 from runtime.clock import NS_PER_MS
 from runtime.daemon.solver_parts import RunningSolver, SolverSetup
-from runtime.frame.effort import REST, CostBook
+from runtime.frame.effort import REST, CostBook, stages_for
 from runtime.frame.messages import Busy, Idle, Live, Order, Slot, SolverUpdate, Stepped
 from runtime.frame.solver_host import first_request
 from runtime.model.buffers import LayerSlots
@@ -102,7 +102,8 @@ class _Serving:
         if solution is not None and solution.effort is not None:
             stages = solution.stage_ms
             rest_ms = max(took_ns / NS_PER_MS - sum(stages.get(stage, 0.0) for stage in SOLVING_STAGES), 0.0)
-            self._costs.learn(solution.effort, {**stages, REST: rest_ms})
+            people = max(len(solution.people), 1)
+            self._costs.learn(solution.effort, stages_for({**stages, REST: rest_ms}, people=1 / people))
         self._live = self._parts.live(time.monotonic_ns())
         bare = SolverUpdate(_bare(solution), _bare(update.flat), update.missing)
         places = self._handed_over(solution), self._handed_over(update.flat)

@@ -25,7 +25,7 @@ ALIGNED, LIVE = Sampling(step=2), Sampling(rays=4)
 QUICK = Sampling(step=4)  # within 0.1 dB of `ALIGNED` in a third of the time, for a live page
 ALIGNED_LARGE, LIVE_LARGE = Sampling(step=4), Sampling(step=2)  # for pictures with more values than `PLENTY`
 FIGURES = ("light_db", "psnr_db", "ssim", "carried_db", "psnr_db_true_eyes", "carried_db_true_eyes")
-Pictures = tuple[U8, U8]  # (h, w, 3) pictures for the left and right eyes, at a panel's resolution
+Pictures = tuple[U8, ...]  # (h, w, 3) pictures for the left and right eyes of each person, at a panel's resolution
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +44,7 @@ class RefreshQuality:
 
     figures: dict[str, float] = field(default_factory=dict)  # measured values, keyed by name (FIGURES)
     live_error: float | None = None  # mean squared error of the light at the true eyes
+    people_errors: dict[int, float] = field(default_factory=dict)  # the same, by number of the person
     moment: Moment | None = None  # pictures for the contact sheet and the viewer page
 
 
@@ -75,18 +76,45 @@ def measure_refresh(
     panels. `carried` are the layers aligned as if all content were on the middle panel, and those before alignment;
     None if more than a solution was shown. `quick` measures only the light at the aligned eyes, on fewer pixels.
     """
-    error = None
-    if targets.true is not None and account.true_eyes_m is not None:
-        try:
-            error = live_error(layers, targets.true, stack, eyes_m=account.true_eyes_m, fov_deg=targets.fov_deg)
-        except ValueError as why:
-            log.info("the live quality of this refresh was not measured: %s", why)
+    errors = _live_errors(account, layers, targets, stack)
+    error = float(np.mean(list(errors.values()))) if errors else None
     try:
         moment, figures = _at_aligned_eyes(account, layers, carried, targets, stack, quick=quick)
     except ValueError as why:
         log.info("the quality of this refresh was not measured: %s", why)
-        return RefreshQuality(live_error=error)
-    return RefreshQuality(figures, error, moment)
+        return RefreshQuality(live_error=error, people_errors=errors)
+    return RefreshQuality(figures, error, errors, moment)
+
+
+def true_eyes_of(account: RefreshAccount) -> dict[int, F64]:
+    """Return the true eyes (2, 3) of everybody who is served, by number. If nobody is, those of a present viewer, as
+    number 0.
+    """
+    people = {person.number: person.true_eyes_m for person in account.people} or {0: account.true_eyes_m}
+    return {number: eyes_m for number, eyes_m in people.items() if eyes_m is not None}
+
+
+def _live_errors(account: RefreshAccount, layers: U8, targets: RefreshTargets, stack: PanelStack) -> dict[int, float]:
+    errors: dict[int, float] = {}
+    for n, (number, true_m) in enumerate(true_eyes_of(account).items() if targets.true is not None else ()):
+        assert targets.true is not None
+        pictures = targets.true[2 * n : 2 * n + 2]
+        try:
+            errors[number] = live_error(layers, pictures, stack, eyes_m=true_m, fov_deg=targets.fov_deg)
+        except ValueError as why:
+            log.info("the live quality of this refresh was not measured: %s", why)
+    return errors
+
+
+def solved_eyes_of(account: RefreshAccount) -> tuple[F64, F64] | None:
+    """Return the eyes that the solution was computed for and those it was aligned to, (2P, 3) each, of the people it
+    was computed for. None if there are none.
+    """
+    people = [(person.solved_for_m, person.eyes_m) for person in account.people if person.solved_for_m is not None]
+    if not people:
+        return None
+    solved, used = zip(*people, strict=True)
+    return np.concatenate(solved), np.concatenate(used)
 
 
 def _at_aligned_eyes(
@@ -98,10 +126,12 @@ def _at_aligned_eyes(
     *,
     quick: bool,
 ) -> tuple[Moment | None, dict[str, float]]:
-    eyes_m, solved_for_m, true_m = account.eyes_m, account.solved_for_m, account.true_eyes_m
-    fov_deg = targets.fov_deg
-    if carried is None or eyes_m is None or solved_for_m is None or targets.solved is None or targets.used is None:
+    fov_deg, eyes = targets.fov_deg, solved_eyes_of(account)
+    if carried is None or eyes is None or targets.solved is None or targets.used is None:
         return None, {}
+    solved_for_m, eyes_m = eyes
+    true = [*true_eyes_of(account).values()]
+    true_m = np.concatenate(true) if 2 * len(true) == len(eyes_m) else None
 
     aligned, unaligned = carried
 

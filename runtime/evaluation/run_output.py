@@ -13,6 +13,7 @@ from typing import Any, TextIO
 
 from runtime.errors import InputError
 from runtime.evaluation.contact_sheet import Moment, contact_sheet, headline
+from runtime.evaluation.displayed import eye_names
 from runtime.evaluation.refresh_quality import Pictures
 from runtime.records import U8
 from runtime.support.artifacts import OutputFolder, to_json, write_json, write_png, write_text
@@ -101,7 +102,7 @@ class RunOutput:
 
         def write() -> None:
             for name, pictures in (("drawn", drawn), ("true", true)):
-                for eye, picture in zip(("left", "right"), pictures or (), strict=False):
+                for eye, picture in zip(eye_names(len(pictures or ())), pictures or (), strict=True):
                     write_png(self._light(frame) / f"{name}-{eye}.png", picture)
             write_json(self._light(frame) / "light.json", info)
 

@@ -35,6 +35,8 @@ HORIZON_S = 0.2  # longest prediction; after this time without a sample, eyes ar
 COAST_S = 0.4  # a lost head moves on for at most this long after its newest sample
 DECAY_S = 0.2  # time constant for slowing a lost head to rest; most heads move on while the sensor misses them
 REVIVE_S = 0.06  # length of the blend when lost eyes are found again
+IDENTITY_S = 0.25  # a person unseen for longer is not told from others by their movement
+HEAD_ACCELERATION = 10.0  # limit in m/s² for deciding who is who; people who sit, walk or lean stay below it
 CLOCK_RESET_NS = NS_PER_S  # if a capture time is this far in the past, the clock was set back
 COMPLETED_NOISE = 2.0  # factor for the standard deviation of a pair of eyes if one eye's position is inferred
 NOISE_FLOOR_M = 2e-5  # smallest standard deviation accepted from a driver; no sensor measures pupils more precisely
@@ -156,6 +158,7 @@ class Tracker:
         self.settings = settings or TrackerSettings()
         self._panel_m, self._in_front_m = panel_m, in_front_m
         self._measured = NoiseWatch()
+        self.replaced = 0  # how often another person has become the viewer
         self._history: deque[_Shown] = deque(maxlen=HISTORY)
         self._other: _Other | None = None
         self._lost_ns: int | None = None
@@ -186,6 +189,36 @@ class Tracker:
         if not refused:
             self._measured.add(sample.head_m, capture_ns=capture_ns)
         return refused
+
+    @property
+    def seen_ns(self) -> int | None:
+        """Capture time of the newest accepted sample, or None if there is none."""
+        return self._history[-1].head.capture_ns if self._history else None
+
+    @property
+    def is_established(self) -> bool:
+        """True if enough samples have been accepted that the head is not a mistake."""
+        return bool(self._history) and self._history[-1].head.samples >= ESTABLISHED
+
+    def reach_m(self, points: EyePoints, *, capture_ns: int) -> tuple[float, float] | None:
+        """Return how far a sample is from the head's expected position, and how far it may be if it is the same head.
+
+        Returns None if it is not the same head, because it is too far away, does not continue the head's motion, or the
+        head was not seen for longer than `IDENTITY_S`.
+        """
+        if not self._history:
+            return None
+        head = self._history[-1].head
+        age_s = head.age_s(capture_ns)
+        if not 0.0 < age_s <= IDENTITY_S:
+            return None
+        fast_m = REACH_SPEED * age_s
+        moved_m = min(fast_m, HEAD_ACCELERATION * age_s**2 / 2) if head.samples >= ESTABLISHED else fast_m
+        sample = _Sample(capture_ns, HEAD_FROM_EYES @ points.eyes_m, self._noise(points))
+        noise_m = math.sqrt(np.trace(sample.noise_m2 + SLACK_M2 + head.belief.covariance[0, :3, :3]))
+        off_m = float(np.linalg.norm(sample.head_m[0] - imm.ahead(head.moments, min(age_s, HORIZON_S))[0]))
+        radius_m = moved_m + 4 * noise_m
+        return None if off_m > radius_m or sample.continued(head) is None else (off_m, radius_m)
 
     def forget(self) -> None:
         """Reset the tracker to its initial state."""
@@ -248,6 +281,7 @@ class Tracker:
             self._follow(head, is_return=True)
         elif age_s > min(ANOTHER_AFTER_S, self.settings.hold_s):
             self._history.clear()
+            self.replaced += 1
             self._follow(other.head)
         else:
             self._other = other

@@ -10,10 +10,11 @@ import numpy as np
 from runtime.clock import NS_PER_MS, NS_PER_S
 from runtime.config import Settings
 from runtime.frame.effort import HORIZON_S, Costs, EffortChooser, Outlook, candidates, display_spread_s
+from runtime.frame.served import matched, moved_m2, sigma_factor
 from runtime.frame.solver_host import SolverHost
 from runtime.frame.viewer import Viewer
+from runtime.optics.alignment import midpoints
 from runtime.plan.focusing import may_focus
-from runtime.plan.savings import selected_eyes
 from runtime.records import F64, Effort, EyesEstimate, EyesLabel, FrameTiming, Solution, SolveRequest
 
 HORIZON_NS = NS_PER_S // 8  # how far ahead the eyes are predicted at most, from the current refresh's display time
@@ -85,7 +86,7 @@ class Aim:
         self._learn(shown, eyes)
         begins_ns = min(max(self._solver.free_ns(now_ns), now_ns), now_ns + self._period_ns)  # else replaced by then
         slots = Slots(timing.photon_ns, composed_ns, begins_ns, self._period_ns)
-        facts, refined, costs = self._solver.facts, None, self._solver.costs
+        facts, refined, costs = self._solver.facts, None, self._solver.costs.for_people(len(eyes.people))
         whole = self._fixed or Effort(1, facts.steps)
         effort, expected_m2 = whole, 0.0
         timed = tuple(by for by in facts.reductions if by in costs.stages)  # a new model may lack timings
@@ -103,7 +104,7 @@ class Aim:
             if shown is not None and eyes.label == "rested":
                 most = facts.refined_steps
                 refined = self._refined(shown, most, costs, shown_error=error, horizon_s=horizon_s)
-                if refined is None and may_focus(facts.info, settings.content.focus):
+                if refined is None and len(eyes.people) < 2 and may_focus(facts.info, settings.content.focus):
                     refined = focused(shown, most, costs, horizon_s=horizon_s)
             cost_ms = costs.ms(effort)
             expected_m2 = outlook(cost_ms).moved_m2(display_spread_s(cost_ms, period_ms=period_ms))
@@ -113,7 +114,7 @@ class Aim:
         while len(self._expected) > REQUESTS_KEPT:
             self._expected.pop(next(iter(self._expected)))
         # When the solution is shown, it is aligned to newer eyes, so only the current eyes' uncertainty matters.
-        return SolveRequest(then_ns, then_m, label, eyes.sigma_m, flat_wanted, paused, effort, refined)
+        return SolveRequest(then_ns, then_m, label, eyes.sigma_m, flat_wanted, paused, effort, refined, eyes.people)
 
     def _learn(self, shown: Solution | None, eyes: EyesEstimate) -> None:
         """Update the statistics from the latest solution's measures and from how far the eyes have moved."""
@@ -121,8 +122,7 @@ class Aim:
             return
         expected_m2 = self._expected.get(shown.solved_for_ns, 0.0)
         if expected_m2 > 0.0 and eyes.eyes_m is not None and eyes.label != "held":
-            eyes_m = selected_eyes(eyes.eyes_m, shown.seeing)  # otherwise, an unseen eye would count as movement
-            found_m2 = float(((shown.solved_for_m - eyes_m).mean(axis=0) ** 2).sum())
+            found_m2 = moved_m2(*matched(shown, eyes))
             self._chooser.foresight.learn(expected_m2=expected_m2, found_m2=found_m2)
         if shown.number != self._learned and shown.measures is not None and shown.effort is not None:
             self._learned = shown.number
@@ -135,11 +135,13 @@ class Aim:
         middle_ns = slots.middle_ns(cost_ns)
         reach_ns = min(middle_ns, slots.photon_ns + HORIZON_NS)
         then = self._viewer.ahead(reach_ns) if eyes.eyes_m is not None else eyes
-        if then.eyes_m is None or eyes.eyes_m is None:
+        if then.eyes_m is None or eyes.eyes_m is None or then.people != eyes.people:
             return middle_ns, eyes.eyes_m, eyes.label
-        moved_m2 = float(((then.eyes_m - eyes.eyes_m).mean(axis=0) ** 2).sum())
-        share = moved_m2 / (moved_m2 + 2 * then.sigma_m**2) if moved_m2 > 0.0 and then.label != "rested" else 1.0
-        return middle_ns, eyes.eyes_m + share * (then.eyes_m - eyes.eyes_m), then.label
+        # A person who hardly moves keeps their place, whatever others do.
+        people_m2 = [float((step_m**2).sum()) for step_m in midpoints(then.eyes_m - eyes.eyes_m)]
+        rests, error_m2 = then.label == "rested", 2 * then.sigma_m**2
+        shares = [m2 / (m2 + error_m2) if m2 > 0.0 and not rests else 1.0 for m2 in people_m2]
+        return middle_ns, eyes.eyes_m + np.repeat(shares, 2)[:, None] * (then.eyes_m - eyes.eyes_m), then.label
 
     def _outlook(self, slots: Slots, eyes: EyesEstimate) -> Callable[[float], Outlook]:
         far_ns = max(HORIZON_NS, self._period_ns)
@@ -148,19 +150,21 @@ class Aim:
         if far.label == "rested":
             self._speed2 = 0.0
             return lambda cost_ms: Outlook()
-        if eyes.eyes_m is None or near.eyes_m is None or far.eyes_m is None:  # a lost head, soon given up
+        seen = {each.people if each.eyes_m is not None else None for each in (eyes, near, far)}
+        if eyes.eyes_m is None or near.eyes_m is None or len(seen) > 1:  # a lost head, soon given up
             lost = Outlook(eyes.sigma_m, self._speed2**0.5)
             return lambda cost_ms: lost
-        moved_m2 = float(((near.eyes_m - eyes.eyes_m).mean(axis=0) ** 2).sum())
-        unsure_m = max(near.sigma_m - eyes.sigma_m, 0.0)  # explains this much movement along each axis
-        speed_m_s = self._usual_speed_m_s(max(moved_m2 - 2 * unsure_m**2, 0.0) ** 0.5, eyes)
+        factor = sigma_factor(len(eyes.people))
+        unsure_m = factor * max(near.sigma_m - eyes.sigma_m, 0.0)  # explains this much movement along each axis
+        near_m2 = moved_m2(eyes.eyes_m, near.eyes_m)
+        speed_m_s = self._usual_speed_m_s(max(near_m2 - 2 * unsure_m**2, 0.0) ** 0.5, eyes)
 
         # At 8 Hz or less, both times are the same, and so are both deviations.
         growth_m = max(far.sigma_m - near.sigma_m, 0.0) / max(far_ns - self._period_ns, 1)
 
         def outlook(cost_ms: float) -> Outlook:
             ahead_ns = slots.middle_ns(round(cost_ms * NS_PER_MS)) - slots.photon_ns
-            sigma_m = near.sigma_m + growth_m * (ahead_ns - self._period_ns)
+            sigma_m = factor * (near.sigma_m + growth_m * (ahead_ns - self._period_ns))
             beyond_s = max(ahead_ns - HORIZON_NS, 0) / NS_PER_S
             return Outlook(sigma_m, speed_m_s, beyond_s * speed_m_s)
 
@@ -190,8 +194,11 @@ class Aim:
         pictures = self._chooser.pictures
         if shown is None or shown.effort is None or shown.solved_for_m is None or eyes.eyes_m is None:
             return pictures.contrast
-        eyes_m = selected_eyes(eyes.eyes_m, shown.seeing)
-        moved_m = float(np.linalg.norm((shown.solved_for_m - eyes_m).mean(axis=0)))
+        if set(eyes.people) - set(shown.people) and len(eyes.people) > 1:
+            return pictures.contrast  # somebody waits for a picture
+        then_m, now_m = matched(shown, eyes)
+        alone = len(now_m) == 2
+        moved_m = float(np.linalg.norm((then_m - now_m).mean(axis=0))) if alone else moved_m2(then_m, now_m) ** 0.5
         return pictures.own(shown.effort) + pictures.stale(moved_m, (time_ns - shown.solved_for_ns) / NS_PER_S)
 
     def _refined(

@@ -26,6 +26,7 @@ from dataclasses import dataclass, field
 from runtime.records import SOLVING_STAGES, Effort, Measures
 
 FOCUS_DRAWN, FOCUS_STEP = 5, 3  # with focus, the drawn pictures per eye, and a step's cost relative to one without
+PER_PERSON = ("render", "prepare", "inference", "step")  # stages that take as many times as long for several people
 REST = "rest"  # time between two solutions that belongs to no stage, for measurements and for waking up
 HORIZON_S = 1.0  # how long head and content are assumed to continue as they are
 EQUAL = 1.05  # the fastest effort with a mean error at most this many times the lowest is chosen
@@ -61,6 +62,12 @@ class Costs:
 
     stages: Mapping[int, Mapping[str, float]]  # keyed by reduction, then stage or REST; `step`: one step
 
+    def for_people(self, count: int) -> Costs:
+        """Return the costs of solutions for several people: drawing and steps take as many times as long."""
+        if count < 2:
+            return self
+        return Costs({by: stages_for(of, people=count) for by, of in self.stages.items()})
+
     def ms(self, effort: Effort) -> float:
         """Return how long a solution takes from start to complete layers, in milliseconds."""
         stages = self.stages.get(effort.reduction, {})
@@ -71,6 +78,11 @@ class Costs:
             return sum(stages.get(stage, 0.0) for stage in begun) + steps * step_ms
         drawn_ms = (FOCUS_DRAWN - 1) * stages.get("render", 0.0)
         return sum(stages.get(stage, 0.0) for stage in begun) + steps * FOCUS_STEP * step_ms + drawn_ms
+
+
+def stages_for(stage_ms: Mapping[str, float], *, people: float) -> dict[str, float]:
+    """Return stage times for several people, given those for one. `people` below 1 is the reverse."""
+    return {stage: ms * people if stage in PER_PERSON else ms for stage, ms in stage_ms.items()}
 
 
 def simulated_costs(stage_ms: Mapping[str, float], reductions: Iterable[int]) -> Costs:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any, Protocol
 
-from runtime.evaluation.refresh_quality import Pictures, RefreshTargets
+import numpy as np
+
+from runtime.evaluation.refresh_quality import Pictures, RefreshTargets, solved_eyes_of, true_eyes_of
 from runtime.frame.presenter import Refresh
 from runtime.frame.targets import TargetDrawer
 from runtime.frame.truth import TrueEyes
@@ -99,12 +101,14 @@ class KeptLight:
                 return
 
     def _draw(self, kept: _Kept, then: Callable[[], None]) -> None:
-        account, true_m = kept.account, self._truth.at(kept.account.photon_ns)
+        account = self._truth.of(kept.account)
         wanted: dict[str, tuple[F64, int]] = {}
-        if account.solved_for_m is not None:
-            wanted["solved"] = account.solved_for_m, kept.solved_for_ns
-        if true_m is not None:
-            wanted["true"] = true_m, account.photon_ns
+        eyes, true = solved_eyes_of(account), [*true_eyes_of(account).values()]
+        solved_for_m = account.solved_for_m if eyes is None else eyes[0]
+        if solved_for_m is not None:
+            wanted["solved"] = solved_for_m, kept.solved_for_ns
+        if true:
+            wanted["true"] = np.concatenate(true), account.photon_ns
 
         def write(targets: RefreshTargets | None) -> None:
             self._write(kept, targets or RefreshTargets(self._drawer.fov_deg))
@@ -113,11 +117,12 @@ class KeptLight:
         self._drawer.draw(wanted, kept.scene, write)
 
     def _write(self, kept: _Kept, targets: RefreshTargets) -> None:
-        account = kept.account
+        account = self._truth.of(kept.account)
         info = {
             "solved_for_m": account.solved_for_m,
             "eyes_m": account.eyes_m,
-            "true_eyes_m": self._truth.at(account.photon_ns),
+            "true_eyes_m": account.true_eyes_m,
             "fov": targets.fov_deg,
+            "people": [asdict(person) for person in account.people],
         }
         self._output.light_targets(account.frame, info=info, drawn=targets.solved, true=targets.true)

@@ -91,7 +91,7 @@ class Live:
     problem: str = ""  # the content's fault
     program: Mapping[str, Any] | None = None  # status of the program that draws the scene
     playlist: Mapping[str, Any] | None = None  # a playlist's entries and position
-    seeing: tuple[bool, bool] = (True, True)  # eyes that can see the display
+    seeing: tuple[bool, ...] = (True, True)  # eyes that can see the display
     measured: Measured = field(default_factory=Measured)  # what the plan's savings are worth
 
 

@@ -12,9 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.clock import NS_PER_S
+from runtime.frame.served import moved_m2
 from runtime.model.geometry import TargetView
 from runtime.model.job import Job
 from runtime.model.solver import REDUCTIONS
+from runtime.optics.alignment import common_movement_m
 from runtime.optics.light import panels_from_centre
 from runtime.optics.presentation import displacement
 from runtime.optics.relief import parallax
@@ -71,10 +73,10 @@ class SolutionMeter:
             return None
         assert before is not None
         before_raster, earlier, solved, earlier_ns = before
-        if before_raster != raster:
+        if before_raster != raster or solved.eyes_m.shape != job.eyes_m.shape:
             return None
         samples = [_grid(_halved(view.pixels)) for view in job.views]
-        moved_m = float(np.linalg.norm((job.eyes_m - solved.eyes_m).mean(axis=0)))
+        moved_m = moved_m2(solved.eyes_m, job.eyes_m) ** 0.5
         shown = _moved_grid(earlier, solved, job.eyes_m)
         changed = float(np.mean([((new - old) ** 2).mean() for new, old in zip(samples, shown, strict=True)]))
         return changed, moved_m, abs(time_ns - earlier_ns) / NS_PER_S
@@ -155,10 +157,13 @@ def _moved_grid(pictures: Sequence[U8], job: Job, eyes_m: Eyes) -> list[F32]:
 
     Args:
         pictures: The job's pictures at half size, from `_halved`.
-        eyes_m: Eyes after the movement, shape (2, 3).
+        eyes_m: Eyes after the movement.
     """
     stack = job.stack
-    moved = parallax(stack, old_m=job.eyes_m.mean(axis=0), new_m=eyes_m.mean(axis=0))
+    old_m = job.eyes_m.mean(axis=0)
+    shared = len(eyes_m) > 2
+    new_m = old_m + common_movement_m(job.eyes_m, eyes_m) if shared else eyes_m.mean(axis=0)
+    moved = parallax(stack, old_m=old_m, new_m=new_m)
     if moved is None or job.relief is None:
         return [_grid(picture) for picture in pictures]
     rows, columns = _grid_lines(pictures[0])

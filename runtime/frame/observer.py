@@ -70,6 +70,7 @@ class RunObserver:
 
     def refreshed(self, refresh: Refresh) -> None:
         self.last = refresh
+        self.truth.meet(refresh.account)
         if self._on_account is not None:
             self._on_account(refresh.account)
         self._lines.add(refresh.account)
@@ -114,4 +115,16 @@ class RunObserver:
 
     def summary(self) -> dict[str, Any]:
         """Return the quality figures for summary.json. Any figure that was not measured is null."""
-        return {**self.live(), **self._sampler.summary()}
+        return {**self.live(), **self._sampler.summary(), "people": self.people()}
+
+    def people(self) -> list[dict[str, Any]]:
+        """Return the live quality and the view error of each person who was served, if their true eyes are known."""
+        live_db, errors_mm = self._sampler.live_db_of_people, self._lines.people_mm
+        return [
+            {
+                "number": number,
+                "live_db": live_db.get(number),
+                "view_error_mm": errors_mm[number].of("p50", "p95") if number in errors_mm else None,
+            }
+            for number in sorted(errors_mm.keys() | live_db.keys())
+        ]

@@ -10,6 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
 from runtime.clock import NS_PER_S
 from runtime.plan.savings import Plan, selected_eyes
 from runtime.records import F64, Effort, Eyes, EyesEstimate, SolveRequest
@@ -89,7 +91,7 @@ class FramePolicy:
         if solved is None or (solved.state_version, solved.revision) != (state_version, revision):
             return eyes_m
         assert solved.eyes_m is not None
-        return None if (solved.eyes_m == eyes_m).all() else eyes_m
+        return None if np.array_equal(solved.eyes_m, eyes_m) else eyes_m
 
 
 def _is_more(effort: Effort | None, done: Effort | None) -> bool:

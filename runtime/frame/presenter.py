@@ -25,6 +25,7 @@ from runtime.frame.messages import SolverUpdate
 from runtime.frame.pacing import Pacer
 from runtime.frame.policy import Flatness, wants_flat
 from runtime.frame.run_state import RunState
+from runtime.frame.served import accounts_of, matched
 from runtime.frame.solver_host import SolverHost
 from runtime.frame.states import Conditions, Lateness, Part, StateMachine
 from runtime.frame.stats import RunStats
@@ -32,7 +33,6 @@ from runtime.frame.viewer import Viewer
 from runtime.optics.alignment import Alignment, align
 from runtime.optics.stack import PanelStack
 from runtime.panels.base import PanelSink
-from runtime.plan.savings import selected_eyes
 from runtime.records import (
     SHOWN_STAGES,
     Effort,
@@ -271,10 +271,10 @@ class Presenter:
         last = self._aligned
         if eyes.eyes_m is None:
             return replace(last[2], limited="") if last is not None and last[0] == solution.number else Alignment(())
-        eyes_m = selected_eyes(eyes.eyes_m, solution.seeing)
+        solved_for_m, eyes_m = matched(solution, eyes)
         key = eyes_m.tobytes()
         if last is None or last[:2] != (solution.number, key):
-            alignment = align(self.stack, solved_for_m=solution.solved_for_m, eyes_m=eyes_m)
+            alignment = align(self.stack, solved_for_m=solved_for_m, eyes_m=eyes_m)
             self._aligned = last = solution.number, key, alignment
         return last[2]
 
@@ -349,17 +349,19 @@ class Presenter:
             stage_ms["finish"] += solution.stage_ms.get("step", 0.0)
         if solution is not None:
             self._shown_solution = solution.number
+        people = accounts_of(solution, eyes)
+        solved_for_m = None if solution is None or solution.solved_for_m is None else solution.solved_for_m[:2]
         return RefreshAccount(
             frame=timing.id,
             capture_ns=eyes.capture_ns,
             predicted_for_ns=timing.photon_ns,
             present_ns=report.present_ns if report is not None else self.clock.now_ns(),
-            eyes_m=eyes.eyes_m,
+            eyes_m=people[0].eyes_m if people else None,
             eyes_label=eyes.label,
             eye_sigma_mm=eyes.sigma_m * 1e3 if eyes.eyes_m is not None else None,
             state=state,
             solution=solution.number if solution is not None else None,
-            solved_for_m=solution.solved_for_m if solution is not None else None,
+            solved_for_m=people[0].solved_for_m if len(people) > 1 else solved_for_m,
             solution_age_ms=(photon_ns - solution.solved_for_ns) / NS_PER_MS if solution is not None else None,
             inference="ran" if ran else "reused" if solution is not None else "skipped",
             presented=report is not None,
@@ -367,6 +369,7 @@ class Presenter:
             photon_ns=photon_ns,
             stage_ms=stage_ms,
             effort=solution.effort.name if solution is not None and solution.effort is not None else None,
+            people=people,
         )
 
     def _report(

@@ -19,14 +19,21 @@ from typing import Any
 import numpy as np
 
 from runtime.evaluation.contact_sheet import Moment
-from runtime.evaluation.refresh_quality import FIGURES, RefreshQuality, RefreshTargets, measure_refresh
+from runtime.evaluation.refresh_quality import (
+    FIGURES,
+    RefreshQuality,
+    RefreshTargets,
+    measure_refresh,
+    solved_eyes_of,
+    true_eyes_of,
+)
 from runtime.frame.presenter import Refresh
 from runtime.frame.targets import TargetDrawer
 from runtime.frame.truth import TrueEyes
 from runtime.optics.presentation import shown_layers
 from runtime.optics.quality import psnr_db
 from runtime.optics.stack import PanelStack
-from runtime.records import F64, State
+from runtime.records import F64, RefreshAccount, State
 from runtime.support.background import BACKGROUND_NICENESS, MEASURING_NICENESS, BackgroundJob
 
 HELD_MAX = 5  # maximum number of refreshes queued in real time
@@ -72,6 +79,7 @@ class QualitySampler:
         self.only_live = False  # if True, only live quality is measured
         self.measured: dict[str, list[float]] = {}  # values for each sampled refresh, keyed by name in FIGURES
         self.live: dict[int, float] = {}  # mean squared error of the light at the true eyes, by refresh number
+        self._people: dict[int, list[float]] = {}  # the same errors, by number of the person; 0: nobody was served
         self.moment: Moment | None = None  # latest measured refresh, for the stills, contact sheet and viewer page
         self._waiting: deque[_Sample] = deque()
         self._job: BackgroundJob[RefreshQuality] | None = None
@@ -172,58 +180,55 @@ class QualitySampler:
         been measured.
         """
         drawn: list[RefreshTargets | None] = []
-        true_m = self._truth.at(last.account.photon_ns)
-        self._drawer.draw(self._wanted(last, true_m), None, drawn.append)
+        account = self._truth.of(last.account)
+        self._drawer.draw(self._wanted(last, account), None, drawn.append)
         ends_s = time.monotonic() + DRAWN_WITHIN_S
         while not drawn and not self._simulated and time.monotonic() < ends_s:
             time.sleep(LOOK_S)
             self._drawer.look()
         if not drawn:
             return
-        quality = self._compared(last, true_m, drawn[0])
+        quality = self._compared(last, account, drawn[0])
         counts = not self.measured and last.account.state is State.TRACKING
         self._take(last.account.frame, quality, figures=counts, live=not self.live)
 
     def _begin(self, sample: _Sample) -> None:
         refresh, frame = sample.refresh, sample.refresh.account.frame
-        true_m = None if self._newest else self._truth.at(refresh.account.photon_ns)
-        wanted = self._wanted(refresh, true_m)
+        account = refresh.account if self._newest else self._truth.of(refresh.account)
+        wanted = self._wanted(refresh, account)
         if not wanted:
             return
 
         def compare(targets: RefreshTargets | None) -> None:
             if self._simulated:
-                self._take(frame, self._compared(refresh, true_m, targets))
+                self._take(frame, self._compared(refresh, account, targets))
             elif targets is not None:
                 self._job_frame = frame
                 niceness = BACKGROUND_NICENESS if self._newest else MEASURING_NICENESS
                 self._job = BackgroundJob(
-                    "quality", lambda: self._compared(refresh, true_m, targets), niceness=niceness
+                    "quality", lambda: self._compared(refresh, account, targets), niceness=niceness
                 )
             self._drawing = False
 
         self._drawing = True
         self._drawer.draw(wanted, sample.scene, compare)
 
-    def _wanted(self, refresh: Refresh, true_m: F64 | None) -> dict[str, tuple[F64, int]]:
+    def _wanted(self, refresh: Refresh, account: RefreshAccount) -> dict[str, tuple[F64, int]]:
         """Return the eyes (2, 3) and the time to draw each target for, keyed by field of `RefreshTargets`."""
-        account, solution = refresh.account, refresh.solution
+        solution, true, eyes = refresh.solution, [*true_eyes_of(account).values()], solved_eyes_of(account)
         wanted: dict[str, tuple[F64, int]] = {}
-        if true_m is not None:
-            wanted["true"] = true_m, account.photon_ns
+        if true:
+            wanted["true"] = np.concatenate(true), account.photon_ns
         if self.only_live:
             return wanted
-        if solution is None or solution.solved_for_m is None or account.eyes_m is None:
-            return wanted
-        if is_measurable(refresh):
-            wanted["solved"] = solution.solved_for_m, solution.solved_for_ns
-            wanted["used"] = account.eyes_m, solution.solved_for_ns
+        if solution is not None and eyes is not None and is_measurable(refresh):
+            wanted["solved"] = eyes[0], solution.solved_for_ns
+            wanted["used"] = eyes[1], solution.solved_for_ns
         return wanted
 
-    def _compared(self, refresh: Refresh, true_m: F64 | None, targets: RefreshTargets | None) -> RefreshQuality:
+    def _compared(self, refresh: Refresh, account: RefreshAccount, targets: RefreshTargets | None) -> RefreshQuality:
         if targets is None:
             return RefreshQuality()
-        account = replace(refresh.account, true_eyes_m=true_m)
         frame, carried = refresh.frame, None
         if targets.used is not None:
             aligned = replace(frame, parallax=None)
@@ -249,11 +254,22 @@ class QualitySampler:
             self.measured.setdefault(name, []).append(value)
         if live and quality.live_error is not None:
             self.live[frame] = quality.live_error
+            for number, error in quality.people_errors.items():
+                self._people.setdefault(number, []).append(error)
 
     @property
     def live_db(self) -> float | None:
         """Live quality of the refreshes measured so far, in dB (docs/contracts.md, Error)."""
         return round(psnr_db(float(np.mean(list(self.live.values())))), 3) if self.live else None
+
+    @property
+    def live_db_of_people(self) -> dict[int, float]:
+        """Live quality of each person who was served, in dB, by number. Refreshes before the only one count as well."""
+        people = {number: errors for number, errors in self._people.items() if number}
+        if len(people) == 1 and 0 in self._people:
+            (number,) = people
+            people[number] = self._people[0] + people[number]
+        return {number: round(psnr_db(float(np.mean(errors))), 3) for number, errors in people.items()}
 
     def summary(self) -> dict[str, Any]:
         """Return the quality figures for summary.json. Any figure that was not measured is null."""
@@ -272,7 +288,7 @@ def has_picture(refresh: Refresh) -> bool:
         and refresh.frame.flatness == 0.0
         and solution is not None
         and solution.solved_for_m is not None
-        and solution.seeing == (True, True)
+        and all(solution.seeing)
     )
 
 

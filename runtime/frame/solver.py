@@ -45,8 +45,8 @@ class Solver:
         self.run, self.stack, self._timed = run, stack, timed
         self.measured = Measured()  # times and errors measured for each item of the plan
         self.plan: Plan | None = None
-        self._planned_for: tuple[int, tuple[bool, bool]] | None = None
-        self._seeing = (True, True)
+        self._planned_for: tuple[int, tuple[bool, ...]] | None = None
+        self._seeing: tuple[bool, ...] = (True, True)
         self._policy = FramePolicy()
         self._solved: SolutionKey | None = None
         self._flat: SolutionKey | None = None
@@ -148,7 +148,7 @@ class Solver:
             prediction.layers,
             eyes_m,
             request.time_ns,
-            seeing=self.plan.eyes if self.plan is not None else (True, True),
+            seeing=self.plan.eyes if self.plan is not None else (True,) * len(eyes_m),
             eye_sigma_m=sigma_m,
             stage_ms=watch.stage_ms,
             effort=effort,
@@ -157,6 +157,7 @@ class Solver:
             else self._meter.measure(job, prediction.layers, effort, time_ns=request.time_ns),
             relief=job.relief,
             state_version=state.version,
+            people=request.people,
         )
         return SolverUpdate(solution=solution)
 
@@ -176,8 +177,8 @@ class Solver:
         )
         self._kept = None
         if request.eyes_label == "rested" and not any(isinstance(v.picture, DrawnPicture) for v in job.views):
-            left, right = (TargetView(view.pixels.copy(), view.plane_from_picture) for view in job.views)
-            job = self._kept = replace(job, targets=replace(job.targets, views=(left, right)))
+            views = tuple(TargetView(view.pixels.copy(), view.plane_from_picture) for view in job.views)
+            job = self._kept = replace(job, targets=replace(job.targets, views=views))
         return job
 
     def _draw_flat(self, state: SceneState, *, revision: int, time_ns: int) -> SolverUpdate:
@@ -202,7 +203,7 @@ class Solver:
         return SolverUpdate(flat=flat, missing=dict(self._missing))  # the model's fault is not over
 
     @property
-    def seeing(self) -> tuple[bool, bool]:
+    def seeing(self) -> tuple[bool, ...]:
         """For the left and the right eye, True if the eye can see the display."""
         return self._seeing
 
@@ -216,7 +217,7 @@ class Solver:
             self.plan = self._plan_of(state, seeing, self.measured)
 
     @staticmethod
-    def _plan_of(state: SceneState, seeing: tuple[bool, bool], measured: Measured) -> Plan:
+    def _plan_of(state: SceneState, seeing: tuple[bool, ...], measured: Measured) -> Plan:
         return make_plan(state.content.info, state.settings, seeing=seeing, measured=measured)
 
     def _failed(self, part: str, error: BaseException, *, expected: type[Exception]) -> dict[str, str]:

@@ -197,6 +197,8 @@ class SimulatedSolver(SolverHost):
     def _timed(self, step: SolverUpdate) -> tuple[SolverUpdate, int]:
         """Return a step's result with the configured stage times filled in, and its cost in nanoseconds."""
         solution, flat, costs = step.solution, step.flat, self.costs
+        if solution is not None:
+            costs = costs.for_people(len(solution.people))
         if solution is not None and solution.effort is not None:
             effort = solution.effort
             stages = dict(costs.stages[effort.reduction])

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+
+import numpy as np
 
 from runtime.clock import NS_PER_S
 from runtime.config import Settings
 from runtime.eyes.calibration import Calibration
+from runtime.eyes.people import People, Person
 from runtime.eyes.plausibility import RefusalWatch
 from runtime.eyes.rest import RestWatch
 from runtime.eyes.tracker import Tracker
-from runtime.records import EyesEstimate, SensorFrame
+from runtime.records import EyesEstimate, EyesLabel, SensorFrame
 
 log = logging.getLogger("phasestack.viewer")
 
@@ -22,15 +25,15 @@ IN_FRONT_M = 0.01  # eyes that are not at least this far in front of the front p
 
 
 class Viewer:
-    """Estimates one viewer's eyes in the `stack` frame from a sensor's samples.
+    """Estimates the eyes of the people who are served, in the `stack` frame, from a sensor's samples.
 
-    Calibrates the samples, tracks the eyes, and detects when the head is at rest. Not thread-safe. Never reads a clock.
+    Calibrates the samples, tracks the eyes, and detects which heads are at rest. Not thread-safe. Never reads a clock.
     """
 
     def __init__(
         self, settings: Settings, calibration: Calibration, *, front_m: float, in_stack_frame: bool = False
     ) -> None:
-        """Create an estimator for a viewer who has not been seen yet.
+        """Create an estimator for people who have not been seen yet.
 
         Args:
             calibration: The sensor's calibration.
@@ -39,27 +42,38 @@ class Viewer:
         """
         self._settings, self._calibration = settings, calibration
         self._nearest_m, self._in_stack_frame = front_m + IN_FRONT_M, in_stack_frame
-        self._tracker = self._new_tracker()
-        self._rest = _rest_watch(settings)
+        self._people = self._new_people()
         self._refusals = RefusalWatch()
         self._serial_checked = False
         self._captures_ns: deque[int] = deque(maxlen=64)
 
     def adopt(self, settings: Settings, calibration: Calibration) -> None:
-        """Adopt new settings and a new calibration.
-
-        The tracker is reset only if its settings have changed.
-        """
+        """Adopt new settings and a new calibration. The trackers are reset only if their settings have changed."""
         before, self._settings, self._calibration = self._settings, settings, calibration
         if settings.tracker != before.tracker:
-            self._tracker = self._new_tracker()
+            self._people = self._new_people()
         if (settings.plan, settings.model) != (before.plan, before.model):
-            self._rest = _rest_watch(settings)
+            self._people.renew_rest()
+
+    def _new_people(self) -> People:
+        settings = self._settings
+        return People(
+            self._new_tracker,
+            lambda: _rest_watch(self._settings),
+            most_served=settings.most_viewers,
+            join_s=settings.tracker.join_s,
+            in_front_m=self._nearest_m,
+        )
 
     def _new_tracker(self) -> Tracker:
         stack = self._settings.stack
         panel_m = stack.width_m, stack.height_m
         return Tracker(self._settings.tracker, panel_m=panel_m, in_front_m=self._nearest_m)
+
+    @property
+    def in_view(self) -> int:
+        """Number of people in front of the display, whether or not they are served."""
+        return self._people.in_view
 
     @property
     def warning(self) -> str:
@@ -86,15 +100,10 @@ class Viewer:
             serial: The sensor's serial number, or "" if it is unknown.
         """
         self._captures_ns.append(frame.capture_ns)
-        points = frame.eyes
-        if points is not None and not self._in_stack_frame:
-            points = self._calibration.apply(points)
-        refused = self._tracker.update(points, capture_ns=frame.capture_ns)
-        if points is not None:
+        people = frame.people if self._in_stack_frame else [self._calibration.apply(points) for points in frame.people]
+        for refused in self._people.update(people, capture_ns=frame.capture_ns):
             if line := self._refusals.update(refused):
                 log.warning("%s", line)
-            if not refused and self._rest is not None:
-                self._rest.update(points.eyes_m, capture_ns=frame.capture_ns)
         if not self._serial_checked and serial:
             self._serial_checked = True
             if warning := self._calibration.serial_warning(serial):
@@ -102,26 +111,46 @@ class Viewer:
 
     def at(self, display_ns: int) -> EyesEstimate:
         """Return the eyes at a refresh's display time, used to align the solution it shows."""
-        return self._served(self._tracker.at(display_ns))
+        return together([self._served(person, person.tracker.at(display_ns)) for person in self._people.served])
 
     def ahead(self, time_ns: int) -> EyesEstimate:
         """Return the eyes at a later time, used by the solver to compute a solution."""
-        return self._served(self._tracker.ahead(time_ns))
+        return together([self._served(person, person.tracker.ahead(time_ns)) for person in self._people.served])
 
-    def _served(self, eyes: EyesEstimate) -> EyesEstimate:
-        """Return `eyes`, corrected in two ways.
+    def _served(self, person: Person, eyes: EyesEstimate) -> EyesEstimate:
+        """Return a person's eyes, corrected in two ways.
 
         If the head is at rest, its fixed eye positions are used instead. Eyes behind or too close to the front panel
         are removed.
         """
+        rest, numbers = person.rest, (person.number,)
         if eyes.eyes_m is None:
             return eyes
-        if self._rest is not None and self._rest.place is not None:
-            label = eyes.label if eyes.label == "held" else "rested"
-            return replace(eyes, eyes_m=self._rest.place, label=label, sigma_m=self._rest.sigma_m)
+        if rest is not None and rest.place is not None:
+            label: EyesLabel = eyes.label if eyes.label == "held" else "rested"
+            return replace(eyes, eyes_m=rest.place, label=label, sigma_m=rest.sigma_m, people=numbers)
         if float(eyes.eyes_m[:, 0].min()) <= self._nearest_m:
             return EyesEstimate(eyes.time_ns, eyes.capture_ns, None, "none")
-        return eyes
+        return replace(eyes, people=numbers)
+
+
+def together(estimates: Sequence[EyesEstimate]) -> EyesEstimate:
+    """Combine the estimates for several people at the same instant into one.
+
+    The label is theirs if it is the same for all, and otherwise `predicted`.
+    """
+    known = [each for each in estimates if each.eyes_m is not None]
+    if len(known) < 2:
+        return known[0] if known else estimates[0]
+    labels = {each.label for each in known}
+    return EyesEstimate(
+        known[0].time_ns,
+        max(each.capture_ns for each in known),
+        np.concatenate([each.eyes_m for each in known if each.eyes_m is not None]),
+        labels.pop() if len(labels) == 1 else "predicted",
+        float(np.sqrt(np.mean([each.sigma_m**2 for each in known]))),
+        tuple(number for each in known for number in each.people),
+    )
 
 
 def _rest_watch(settings: Settings) -> RestWatch | None:

@@ -50,6 +50,23 @@ def reference_plane(stack: PanelStack) -> Plane:
     return Plane(stack.x_m[half] if stack.count % 2 else (stack.x_m[half - 1] + stack.x_m[half]) / 2)
 
 
+def midpoints(eyes_m: Eyes) -> F64:
+    """Return the (P, 3) midpoints between the eyes of each person in (2P, 3)."""
+    middles: F64 = (eyes_m[::2] + eyes_m[1::2]) / 2
+    return middles
+
+
+def common_movement_m(before_m: Eyes, after_m: Eyes) -> F64:
+    """Return the (3,) movement that several people share: along each axis, the least, or 0 if they move oppositely.
+
+    Layers that follow it are exact for whoever moves least. A person at rest keeps a picture at rest.
+    """
+    moved = midpoints(after_m) - midpoints(before_m)
+    least, most = moved.min(axis=0), moved.max(axis=0)
+    common: F64 = np.where(least > 0.0, least, np.where(most < 0.0, most, 0.0))
+    return common
+
+
 def align(stack: PanelStack, *, solved_for_m: Eyes, eyes_m: Eyes) -> Alignment:
     """Align layers that were solved for other eye positions to the current eyes. Never raises an
     exception.
@@ -60,6 +77,8 @@ def align(stack: PanelStack, *, solved_for_m: Eyes, eyes_m: Eyes) -> Alignment:
     """
     if not (np.abs(solved_for_m).max() <= FARTHEST_M and np.abs(eyes_m).max() <= FARTHEST_M):  # also catches NaN
         return Alignment(_as_they_are(stack), "the eye positions are not finite")
+    if len(eyes_m) > 2:
+        eyes_m = solved_for_m + common_movement_m(solved_for_m, eyes_m)
     old_m, new_m = _middle(solved_for_m), _middle(eyes_m)
     # This runs at every refresh, and plain floats are several times as fast as small arrays.
     old, moved = old_m.tolist(), (new_m - old_m).tolist()
@@ -79,8 +98,7 @@ def align(stack: PanelStack, *, solved_for_m: Eyes, eyes_m: Eyes) -> Alignment:
 
 
 def _middle(eyes_m: Eyes) -> F64:
-    middle: F64 = (eyes_m[0] + eyes_m[1]) / 2
-    return middle
+    return np.asarray(midpoints(eyes_m).mean(axis=0))
 
 
 def _as_they_are(stack: PanelStack) -> tuple[F64, ...]:
@@ -94,7 +112,8 @@ def _limits(
     allowed. `limit` is `left` or `right` for an eye's distance, and a panel's number for its shift and scale.
     """
     front_m = stack.x_m[-1]
-    for name, before_m, after_m in zip(("left", "right"), solved_x_m, eyes_x_m, strict=True):
+    names = ("left", "right") * (len(eyes_x_m) // 2)
+    for name, before_m, after_m in zip(names, solved_x_m, eyes_x_m, strict=True):
         room_m = before_m - front_m - NEAREST_M
         yield before_m - after_m, room_m, name
         if room_m < 0.0:

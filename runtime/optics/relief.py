@@ -32,18 +32,19 @@ def block_px(width_px: int) -> int:
 
 
 def relief_of(nearness: Sequence[F32], *, distance_m: Sequence[float], rim_px: int = RIM_PX) -> F32:
-    """Combine the depth seen by the two eyes into one (h, w) relief: for each pixel, that with the larger
-    magnitude. `nearness` are inverse distances along x in 1/m, 0 for the background, and `distance_m` each eye's
-    distance from the middle panel. Nearer content is dilated by `rim_px` relief pixels. Relief that is not finite
-    becomes 0.
+    """Combine the depth seen by all eyes into one (h, w) relief: for each pixel, that with the larger
+    magnitude.
+    `nearness` are inverse distances along x in 1/m, 0 for the background, and `distance_m` each eye's distance from the
+    middle panel. Nearer content is dilated by `rim_px` relief pixels. Relief that is not finite becomes 0.
     """
     rim = np.ones((2 * rim_px + 1,) * 2, np.uint8)
     reliefs = []
     for inverse, eye_m in zip(nearness, distance_m, strict=True):
         kept = cv2.dilate(inverse, rim)
         reliefs.append(np.where(kept > 0.0, kept * np.float32(eye_m) - np.float32(1), np.float32(0)))
-    left, right = reliefs
-    larger = np.where(np.abs(left) > np.abs(right), left, right)
+    larger = reliefs[-1]
+    for relief in reversed(reliefs[:-1]):
+        larger = np.where(np.abs(relief) > np.abs(larger), relief, larger)
     return np.ascontiguousarray(np.where(np.isfinite(larger), larger, 0.0), np.float32)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,13 +20,15 @@ from runtime.records import F32, F64, U8, Eyes
 from runtime.support.gl import DrawnPicture
 
 
-def raster_views(eyes_m: Eyes, raster: PlaneRaster, *, reduction: int = 1) -> tuple[View, View]:
-    """Return both eyes' views, to draw content on a raster with 1/`reduction` of the panels' rows."""
-    left, right = (
-        View(eye, side, raster_from_stack(eye, raster), raster.width_px, raster.height_px, reduction)
-        for side, eye in enumerate(eyes_m)
+def raster_views(eyes_m: Eyes, raster: PlaneRaster, *, reduction: int = 1) -> tuple[View, ...]:
+    """Return each eye's view, used to draw content on a raster, usually the middle panel's.
+
+    `reduction` is the panels' number of rows and columns, divided by the raster's.
+    """
+    return tuple(
+        View(eye, n % 2, raster_from_stack(eye, raster), raster.width_px, raster.height_px, reduction)
+        for n, eye in enumerate(eyes_m)
     )
-    return left, right
 
 
 def retina_view(eye_m: F64, side: int, *, width_px: int, height_px: int, fov_deg: float) -> View:
@@ -36,13 +39,16 @@ def retina_view(eye_m: F64, side: int, *, width_px: int, height_px: int, fov_deg
 
 def retina_pictures(
     content: ContentSource, eyes_m: Eyes, stack: PanelStack, *, fov_deg: float, time_ns: int
-) -> tuple[U8, U8]:
+) -> tuple[U8, ...]:
     """Draw the (h, w, 3) pictures that eyes looking at the origin should see, with a panel's pixels."""
     size = {"width_px": stack.width_px, "height_px": stack.height_px}
-    views = [retina_view(eye, side, **size, fov_deg=fov_deg) for side, eye in enumerate(eyes_m)]
-    content.expect(views, time_ns=time_ns)
-    left, right = (np.ascontiguousarray(content.render(view, time_ns=time_ns)[..., :3]) for view in views)
-    return left, right
+    views = [retina_view(eye, n % 2, **size, fov_deg=fov_deg) for n, eye in enumerate(eyes_m)]
+    pictures: list[U8] = []
+    for first in range(0, len(views), 2):
+        pair = views[first : first + 2]
+        content.expect(pair, time_ns=time_ns)
+        pictures += [np.ascontiguousarray(content.render(view, time_ns=time_ns)[..., :3]) for view in pair]
+    return tuple(pictures)
 
 
 def drawn_job(
@@ -73,13 +79,21 @@ def drawn_job(
             window = extent_window(extent, colour, eyes_m, stack, before)
     if window is not None:
         raster = window.box.cut(raster)
-    views = raster_views(eyes_m, raster, reduction=reduction)
-    content.expect(views, time_ns=time_ns)
-    drawn = [_drawn(predictor, content, view, time_ns=time_ns) for view in views]
-    relief = _relief(content, views, stack, window, every=block_px(predictor.stack.width_px)) if in_depth else None
-    # Reading a picture back waits until it is complete, so draw both pictures before reading either of them back.
-    reads_textures = predictor.reads_textures_of(content.draws_in)
-    pictures = [p.pixels() if isinstance(p, DrawnPicture) and not reads_textures else p for p in drawn]
+    views, every = raster_views(eyes_m, raster, reduction=reduction), block_px(predictor.stack.width_px)
+    reads_textures = predictor.reads_textures_of(content.draws_in) and len(views) == 2
+    pictures: list[U8 | DrawnPicture] = []
+    depths: list[F32 | None] = []
+    for first in range(0, len(views), 2):  # a source has one picture for each side, so people are drawn in turn
+        pair = views[first : first + 2]
+        content.expect(pair, time_ns=time_ns)
+        drawn = [_drawn(predictor, content, view, time_ns=time_ns) for view in pair]
+        if in_depth:
+            nearness = _nearness(content, pair, window, every=every)
+            depths += nearness if len(views) == 2 else [None if depth is None else depth.copy() for depth in nearness]
+        # Reading a picture back waits until it is complete, so draw both pictures before reading either of them back.
+        read = [p.pixels() if isinstance(p, DrawnPicture) and not reads_textures else p for p in drawn]
+        pictures += read if len(views) == 2 else [np.array(p) for p in read]
+    relief = _relief(depths, views, stack, window, every=every) if in_depth else None
     job = Job(Targets(stack, eyes_m, drawn_views(pictures, stack, window)), window=window, relief=relief)
     return trim(job, before) if trimmed else job
 
@@ -92,24 +106,45 @@ def _extent(content: ContentSource, eyes_m: Eyes, middle: PlaneRaster, *, time_n
     return union(known) if len(known) == len(boxes) else None
 
 
-def _relief(
-    content: ContentSource, views: tuple[View, View], stack: PanelStack, window: SolveWindow | None, *, every: int
-) -> F32 | None:
-    """Return the relief of content drawn for both views in a window or the whole, or None if the depth is unknown.
-    `every` is the side of a relief pixel, in panel pixels.
+def _nearness(
+    content: ContentSource, pair: Sequence[View], window: SolveWindow | None, *, every: int
+) -> list[F32 | None]:
+    """Return the inverse distances of the content that was just drawn for a person's views, if the source knows them.
+
+    Args:
+        every: Side of a relief pixel, in panel pixels.
     """
     u0, v0 = (0, 0) if window is None else (window.box.u0, window.box.v0)
-    left, right = (content.nearness(view, every=every, first=(u0 % every, v0 % every)) for view in views)
-    if left is None or right is None:
+    return [content.nearness(view, every=every, first=(u0 % every, v0 % every)) for view in pair]
+
+
+def _relief(
+    depths: Sequence[F32 | None],
+    views: Sequence[View],
+    stack: PanelStack,
+    window: SolveWindow | None,
+    *,
+    every: int,
+) -> F32 | None:
+    """Return the relief, on the middle panel, of the content drawn for all views, or None if a depth is unknown.
+
+    Args:
+        depths: Each view's inverse distances (`_nearness`).
+        window: Window that was drawn on the middle panel. If None, the whole panel was drawn.
+        every: Side of a relief pixel, in panel pixels.
+    """
+    known = [depth for depth in depths if depth is not None]
+    if len(known) < len(views):
         return None
     if window is not None:
-        whole = np.zeros((2, -(-stack.height_px // every), -(-stack.width_px // every)), np.float32)
-        rows, columns = left.shape
-        whole[:, v0 // every :, u0 // every :][:, :rows, :columns] = left, right
-        left, right = whole
+        u0, v0 = window.box.u0, window.box.v0
+        whole = np.zeros((len(views), -(-stack.height_px // every), -(-stack.width_px // every)), np.float32)
+        rows, columns = known[0].shape
+        whole[:, v0 // every :, u0 // every :][:, :rows, :columns] = known
+        known = list(whole)
     middle_m = stack.x_m[stack.count // 2]
     distance_m = [float(view.eye_m[0]) - middle_m for view in views]
-    return relief_of((left, right), distance_m=distance_m, rim_px=RIM_PX if views[0].reduction == 1 else COARSE_RIM_PX)
+    return relief_of(known, distance_m=distance_m, rim_px=RIM_PX if views[0].reduction == 1 else COARSE_RIM_PX)
 
 
 def _drawn(predictor: Predictor, content: ContentSource, view: View, *, time_ns: int) -> U8 | DrawnPicture:

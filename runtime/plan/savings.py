@@ -38,34 +38,32 @@ class Measured:
 class Plan:
     """The eyes to solve for, and a description of all skipped work for an operator to read."""
 
-    eyes: tuple[bool, bool]  # (left, right), True for each eye to solve for
+    eyes: tuple[bool, ...]  # (left, right of each person), True for each eye to solve for
     items: tuple[PlanItem, ...] = field(default=())  # one item for each kind of skipped work
 
 
-def eyes_in_range(eyes_m: Eyes, *, range_deg: float = VISIBLE_DEG) -> tuple[bool, bool]:
+def eyes_in_range(eyes_m: Eyes, *, range_deg: float = VISIBLE_DEG) -> tuple[bool, ...]:
     """Return, for each eye, True if it is within `range_deg` of the axis, seen from the centre."""
     off_axis = np.degrees(np.arctan2(np.linalg.norm(eyes_m[:, 1:], axis=1), eyes_m[:, 0]))
-    left, right = (off_axis <= range_deg).tolist()
-    return left, right
+    return tuple((off_axis <= range_deg).tolist())
 
 
-def seeing_eyes(eyes_m: Eyes, before: tuple[bool, bool]) -> tuple[bool, bool]:
+def seeing_eyes(eyes_m: Eyes, before: tuple[bool, ...]) -> tuple[bool, ...]:
     """Return, for each eye, True if it can see the display, given the previous result. An excluded eye
     must come `RETURN_MARGIN_DEG` inside the range, so that noise does not switch it on and off.
     """
+    before = (*before, *(True,) * len(eyes_m))
     outer = eyes_in_range(eyes_m)
     inner = eyes_in_range(eyes_m, range_deg=VISIBLE_DEG - RETURN_MARGIN_DEG)
-    left, right = (inner[eye] or (before[eye] and outer[eye]) for eye in (0, 1))
-    return left, right
+    return tuple(inner[eye] or (before[eye] and outer[eye]) for eye in range(len(eyes_m)))
 
 
-def selected_eyes(eyes_m: Eyes, seeing: tuple[bool, bool]) -> F64:
-    """Return the (2, 3) eyes to solve for: one that cannot see is replaced by the other, if that can."""
-    if seeing == (True, False):
-        return eyes_m[[0, 0]]
-    if seeing == (False, True):
-        return eyes_m[[1, 1]]
-    return eyes_m
+def selected_eyes(eyes_m: Eyes, seeing: tuple[bool, ...]) -> F64:
+    """Return the (2P, 3) eyes to solve for. One that cannot see is replaced by the person's other, if that can."""
+    if all(seeing):
+        return eyes_m
+    other = [eye ^ 1 if not seeing[eye] and seeing[eye ^ 1] else eye for eye in range(len(seeing))]
+    return eyes_m if other == list(range(len(seeing))) else eyes_m[other]
 
 
 def make_plan(
@@ -73,7 +71,7 @@ def make_plan(
     settings: Settings,
     *,
     eyes_m: Eyes | None = None,
-    seeing: tuple[bool, bool] | None = None,
+    seeing: tuple[bool, ...] | None = None,
     measured: Measured | None = None,
 ) -> Plan:
     """Return the plan for a scene and a viewer, valid until one of them changes. `seeing` is by default
@@ -83,18 +81,17 @@ def make_plan(
     if seeing is None and eyes_m is not None:
         seeing = eyes_in_range(eyes_m)
     if seeing is None or not any(seeing) or not on:
-        seeing = (True, True)
+        seeing = (True,) * len(seeing or (True, True))
     items: list[PlanItem] = []
     if on and not info.moving:
         why = "the content does not move, so the same solution is shown while the head is at rest"
         items.append(_item("render and inference", why, numbers.reuse))
     if on:
         items += network_items(info, numbers)
-    if seeing != (True, True):
-        side = "right" if seeing[0] else "left"
-        items.append(
-            _item(f"the {side} eye", f"this eye is more than {VISIBLE_DEG:g} degrees off the axis", numbers.one_eye)
-        )
+    for eye, sees in enumerate(seeing):
+        if not sees:
+            name = f"the {('left', 'right')[eye % 2]} eye" + (f" of person {eye // 2 + 1}" if len(seeing) > 2 else "")
+            items.append(_item(name, f"this eye is more than {VISIBLE_DEG:g} degrees off the axis", numbers.one_eye))
     if settings.sensor.driver == "fixed":
         items.append(_item("the sensor", "the eye positions are fixed because sensor.driver is `fixed`", Saving()))
     return Plan(seeing, tuple(items))

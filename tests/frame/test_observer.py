@@ -36,7 +36,7 @@ FOV_DEG = 40.0
 CONTRACT = {
     "frame", "capture_ns", "predicted_for_ns", "present_ns", "eyes_m", "eyes_label", "eye_sigma_mm", "state",
     "solution", "effort", "solved_for_m", "solution_age_ms", "true_eyes_m", "inference", "presented", "stage_ms",
-    "skew_ms",
+    "skew_ms", "people",
 }  # fmt: skip
 
 

@@ -108,6 +108,8 @@ def play(case: Case, out: Path) -> Played:
     lines = [json.loads(line) for line in (out / "frames.jsonl").read_text(encoding="utf-8").splitlines()]
     refreshes = [line | told for line, told in zip(lines, collector.refreshes, strict=True)]
     for line in refreshes:
+        if len(line["people"]) < 2:  # the other fields describe the only person
+            del line["people"]
         if line["effort"] is None:
             del line["effort"]
         if line["inference"] != "ran":  # as they were when their solution was first shown

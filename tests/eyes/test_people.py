@@ -1,0 +1,138 @@
+"""Tests that several people are told apart, and who is served."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from runtime.clock import NS_PER_S
+from runtime.eyes.association import assigned
+from runtime.eyes.people import People
+from runtime.eyes.tracker import Tracker
+from runtime.eyes.two_people import MOTIONS_OF_TWO, observe_two
+from runtime.records import F64, EyePoints, SensorFrame
+
+RATE_HZ = 30
+
+
+def people(*, most_served: int = 2, join_s: float = 1.0) -> People:
+    return People(Tracker, lambda: None, most_served=most_served, join_s=join_s, in_front_m=0.07)
+
+
+def head(*place_m: float) -> EyePoints:
+    return EyePoints(np.array([place_m]) + np.array([[0, -0.0315, 0], [0, 0.0315, 0]]), np.ones(2))
+
+
+def fed(crowd: People, *heads: EyePoints, seconds: float, begin_s: float = 0.0) -> list[list[int]]:
+    """Numbers of the people served after each sample with the same heads."""
+    served = []
+    for n in range(round(seconds * RATE_HZ)):
+        crowd.update(heads, capture_ns=round((begin_s + n / RATE_HZ) * NS_PER_S) + 1)
+        served.append([person.number for person in crowd.served])
+    return served
+
+
+def whose(true_m: F64, middle_m: F64) -> int | None:
+    """Index of the nearest of two people, or None if neither is near."""
+    away_m = np.linalg.norm(true_m.reshape(2, 2, 3).mean(axis=1) - middle_m, axis=1)
+    return None if np.isnan(away_m).all() or np.nanmin(away_m) > 0.2 else int(np.nanargmin(away_m))
+
+
+def owners(samples: list[SensorFrame], *, join_s: float = 1.0) -> dict[int, set[int]]:
+    """The true people whose eyes each served number has had."""
+    crowd, had = people(join_s=join_s), dict[int, set[int]]()
+    for sample in samples:
+        crowd.update(sample.people, capture_ns=sample.capture_ns)
+        for person in crowd.served:
+            middle_m, true_m = person.middle_m(sample.capture_ns), sample.true_eyes_m
+            if middle_m is not None and true_m is not None and (owner := whose(true_m, middle_m)) is not None:
+                had.setdefault(person.number, set()).add(owner)
+    return had
+
+
+@pytest.mark.parametrize("motion", MOTIONS_OF_TWO)
+def test_no_number_ever_gets_the_eyes_of_two_people(motion: str) -> None:
+    had = owners(observe_two(motion, seconds=9.0, rate_hz=RATE_HZ, seed=5))
+    assert all(len(owner) == 1 for owner in had.values())
+    assert set.union(*had.values()) == ({0} if motion == "two-pass" else {0, 1})  # who only passes is not served
+
+
+@settings(max_examples=4, deadline=None)
+@given(st.data())
+def test_hiding_and_missing_faces_never_confuse_two_people(data: st.DataObject) -> None:
+    motion = data.draw(st.sampled_from(["two-exchange", "two-lean", "two-still"]))
+    samples = observe_two(motion, seconds=7.0, rate_hz=RATE_HZ, seed=data.draw(st.integers(1, 10**6)))
+    shown = []
+    missing: dict[int, tuple[float, float]] = {}
+    for who in (0, 1):
+        begin_s = data.draw(st.floats(1.5, 6.0))
+        missing[who] = begin_s, begin_s + data.draw(st.floats(0.0, 2.0))
+    for sample in samples:
+        time_s, true_m = sample.capture_ns / NS_PER_S, sample.true_eyes_m
+        assert true_m is not None
+        gone = [who for who, (begin_s, end_s) in missing.items() if begin_s <= time_s < end_s]
+        kept = [one for one in sample.people if whose(true_m, one.eyes_m.mean(axis=0)) not in gone]
+        first, *others = kept or [None]
+        shown.append(SensorFrame(sample.sequence, sample.capture_ns, first, true_eyes_m=true_m, others=tuple(others)))
+    assert all(len(owner) == 1 for owner in owners(shown, join_s=0.2).values())
+
+
+def test_a_head_that_may_be_either_person_is_given_to_nobody() -> None:
+    distance_m, radius_m = np.array([[0.10], [0.11]]), np.full((2, 1), 0.3)
+    assert assigned(distance_m, radius_m) == ([None, None], [True, True])
+
+
+def test_a_head_is_given_to_the_person_who_was_there_a_moment_ago() -> None:
+    distance_m, radius_m = np.array([[0.002], [0.11]]), np.array([[0.03], [0.3]])
+    assert assigned(distance_m, radius_m) == ([0, None], [False, False])
+
+
+@given(st.permutations(range(3)), st.lists(st.floats(0.0, 0.03), min_size=3, max_size=3))
+def test_heads_far_apart_are_assigned_in_any_order(order: list[int], off_m: list[float]) -> None:
+    distance_m = np.full((3, 3), 0.4)
+    for person, column in enumerate(order):
+        distance_m[person, column] = off_m[person]
+    assert assigned(distance_m, np.full((3, 3), 0.05))[0] == list(order)
+
+
+def test_the_nearest_is_served_at_once_and_a_second_after_a_wait() -> None:
+    served = fed(people(join_s=0.5), head(0.6, -0.2, 0.0), head(0.8, 0.3, 0.0), seconds=0.8)
+    assert served[0] == [1] and served[-1] == [1, 2]
+    assert served.index([1, 2]) == pytest.approx(0.5 * RATE_HZ, abs=2)
+
+
+def test_whoever_is_served_keeps_the_place_from_somebody_nearer() -> None:
+    crowd = people(most_served=1)
+    fed(crowd, head(0.8, -0.2, 0.0), seconds=1.0)
+    assert fed(crowd, head(0.5, 0.2, 0.0), head(0.8, -0.2, 0.0), seconds=2.0, begin_s=1.0)[-1] == [1]
+    assert crowd.in_view == 2
+    (number,) = fed(crowd, head(0.5, 0.2, 0.0), seconds=1.0, begin_s=3.0)[-1]
+    assert number == 2  # the first has left
+
+
+def test_the_second_is_served_alone_once_the_first_has_left() -> None:
+    crowd = people(join_s=0.2)
+    fed(crowd, head(0.6, -0.2, 0.0), head(0.8, 0.3, 0.0), seconds=1.0)
+    assert fed(crowd, head(0.8, 0.3, 0.0), seconds=1.0, begin_s=1.0)[-1] == [2]
+
+
+def test_a_third_person_waits_for_a_place() -> None:
+    three = head(0.6, -0.3, 0.0), head(0.7, 0.0, 0.0), head(0.8, 0.3, 0.0)
+    crowd = people(join_s=0.2)
+    assert fed(crowd, *three, seconds=2.0)[-1] == [1, 2]
+    assert fed(crowd, three[0], three[2], seconds=1.0, begin_s=2.0)[-1] == [1, 3]
+
+
+def test_one_mistaken_head_serves_nobody_else() -> None:
+    crowd = people(join_s=0.0)
+    fed(crowd, head(0.6, -0.2, 0.0), seconds=1.0)
+    assert fed(crowd, head(0.6, -0.2, 0.0), head(0.7, 0.3, 0.0), seconds=0.05, begin_s=1.0)[-1] == [1]
+    assert fed(crowd, head(0.6, -0.2, 0.0), seconds=1.0, begin_s=1.1)[-1] == [1] and crowd.in_view == 1
+
+
+def test_two_samples_of_one_face_are_one_person() -> None:
+    crowd = people(join_s=0.1)
+    twice = head(0.6, -0.2, 0.0), head(0.64, -0.18, 0.0)
+    assert fed(crowd, *twice, seconds=1.0)[-1] == [1] and crowd.in_view == 1
