@@ -226,7 +226,7 @@ class Solution:
 
 @dataclass(frozen=True, slots=True)
 class PersonAccount:
-    """One person's part in a refresh. Positions are (2, 3), left and right eye, in metres, in frame `stack`."""
+    """One person's part in a refresh. Eyes are (2, 3), left and right, in metres, in frame `stack`."""
 
     number: int  # counted from 1, in the order in which people came into view
     eyes_m: F64  # eyes that the panels are aligned to, as far as people have moved alike
@@ -256,4 +256,4 @@ class RefreshAccount:
     true_eyes_m: F64 | None = None  # (2, 3) true eyes at the display time, from recordings with ground truth
     stage_ms: dict[str, float] = field(default_factory=dict)  # time taken by each stage, on the run's clock
     effort: str | None = None  # name of the shown solution's effort (`Effort.name`)
-    people: tuple[PersonAccount, ...] = ()  # everybody who is served; the fields above describe the first
+    people: tuple[PersonAccount, ...] = ()  # all people served; the fields above describe the first

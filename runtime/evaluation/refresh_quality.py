@@ -87,8 +87,8 @@ def measure_refresh(
 
 
 def true_eyes_of(account: RefreshAccount) -> dict[int, F64]:
-    """Return the true eyes (2, 3) of everybody who is served, by number. If nobody is, those of a present viewer, as
-    number 0.
+    """Return the true eyes (2, 3) of all people served, by number. While there are none, a present viewer
+    has number 0.
     """
     people = {person.number: person.true_eyes_m for person in account.people} or {0: account.true_eyes_m}
     return {number: eyes_m for number, eyes_m in people.items() if eyes_m is not None}
@@ -107,14 +107,15 @@ def _live_errors(account: RefreshAccount, layers: U8, targets: RefreshTargets, s
 
 
 def solved_eyes_of(account: RefreshAccount) -> tuple[F64, F64] | None:
-    """Return the eyes that the solution was computed for and those it was aligned to, (2P, 3) each, of the people it
-    was computed for. None if there are none.
+    """Return the eyes that the solution was computed for and those it was aligned to.
+
+    Both are (2P, 3), of the people it was computed for. The result is None without such people.
     """
-    people = [(person.solved_for_m, person.eyes_m) for person in account.people if person.solved_for_m is not None]
-    if not people:
-        return None
-    solved, used = zip(*people, strict=True)
-    return np.concatenate(solved), np.concatenate(used)
+    first = (account.solved_for_m, account.eyes_m)
+    people = [(person.solved_for_m, person.eyes_m) for person in account.people] or [first]
+    solved = [solved_for_m for solved_for_m, eyes_m in people if solved_for_m is not None and eyes_m is not None]
+    used = [eyes_m for solved_for_m, eyes_m in people if solved_for_m is not None and eyes_m is not None]
+    return (np.concatenate(solved), np.concatenate(used)) if solved else None
 
 
 def _at_aligned_eyes(

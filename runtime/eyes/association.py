@@ -13,7 +13,7 @@ SIGMAS = 3.0  # a radius of reach in standard deviations
 
 
 def assigned(distance_m: F64, radius_m: F64) -> tuple[list[int | None], list[bool]]:
-    """Assign heads to people, or to nobody if there is doubt.
+    """Assign heads to people, unless there is doubt.
 
     As many people as possible get a head within their reach. Among these assignments, the likeliest is chosen. If
     another one is nearly as likely, all people are in doubt to whom it assigns another head.

@@ -1,4 +1,4 @@
-"""Follow several people, each with a tracker of their own, and decide who is served.
+"""Follow several people, each with one tracker, and decide who is served.
 
 A sensor's heads are assigned to people by what each can have moved (`association`). A person who was hidden for longer
 than `IDENTITY_S`, or whose head could as well be another's, comes back as a new person, with a tracker that remembers
@@ -48,7 +48,7 @@ class Person:
 
 
 class People:
-    """Everybody in front of the display, and the people who are served.
+    """All people in front of the display, and those who are served.
 
     Not thread-safe. Never reads a clock.
     """
@@ -62,7 +62,7 @@ class People:
         join_s: float,
         in_front_m: float,
     ) -> None:
-        """Begin with nobody.
+        """Begin without any people.
 
         Args:
             most_served: Largest number of people served at the same time.
@@ -90,7 +90,7 @@ class People:
         return sum(person.number > 0 and person.tracker.seen_ns is not None for person in self._people)
 
     def renew_rest(self) -> None:
-        """Detect anew who is at rest."""
+        """Replace the detectors of heads at rest."""
         for person in self._people:
             person.rest = self._new_rest()
 
@@ -98,7 +98,7 @@ class People:
         """Add a sample.
 
         Args:
-            seen: Everybody's eyes, nearest first, in frame `stack`.
+            seen: All people's eyes, nearest first, in frame `stack`.
             capture_ns: The sample's capture time.
 
         Returns:
@@ -167,7 +167,7 @@ class People:
     def _assigned(
         people: Sequence[Person], heads: Sequence[tuple[int, EyePoints]], capture_ns: int
     ) -> list[tuple[Person, int | None, bool]]:
-        """Return, for each person who can be told from others, the index of a head or None, and whether it is doubtful.
+        """Return, for each person, the index of a head or None, and whether it is doubtful.
 
         A doubtful head is returned for each person whose head it may be, once in all.
         """
@@ -239,7 +239,7 @@ class People:
         return why
 
     def _part(self, capture_ns: int) -> None:
-        """Forget people who are lost for good and heads that were mistakes."""
+        """Forget people who have left and heads that were mistakes."""
         last = max(self._people, key=lambda person: person.tracker.seen_ns or -1)
         kept = []
         for person in self._people:
@@ -252,7 +252,7 @@ class People:
             kept[0].number = self._next()
 
     def _serve(self, capture_ns: int) -> None:
-        """Keep serving everybody who is not lost, and take in the nearest of the others while there is room."""
+        """Keep serving those who are not lost, and take in the nearest others while there is room."""
         self.served = [person for person in self.served if person in self._people]
         waiting = []
         for person in self._people:

@@ -201,7 +201,7 @@ class Tracker:
         return bool(self._history) and self._history[-1].head.samples >= ESTABLISHED
 
     def reach_m(self, points: EyePoints, *, capture_ns: int) -> tuple[float, float] | None:
-        """Return how far a sample is from the head's expected position, and how far it may be if it is the same head.
+        """Return how far a sample is from the head's expected position, and how far it may be.
 
         Returns None if it is not the same head, because it is too far away, does not continue the head's motion, or the
         head was not seen for longer than `IDENTITY_S`.

@@ -137,7 +137,7 @@ class Aim:
         then = self._viewer.ahead(reach_ns) if eyes.eyes_m is not None else eyes
         if then.eyes_m is None or eyes.eyes_m is None or then.people != eyes.people:
             return middle_ns, eyes.eyes_m, eyes.label
-        # A person who hardly moves keeps their place, whatever others do.
+        # A person who hardly moves keeps their place when others move.
         people_m2 = [float((step_m**2).sum()) for step_m in midpoints(then.eyes_m - eyes.eyes_m)]
         rests, error_m2 = then.label == "rested", 2 * then.sigma_m**2
         shares = [m2 / (m2 + error_m2) if m2 > 0.0 and not rests else 1.0 for m2 in people_m2]

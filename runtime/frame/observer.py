@@ -118,7 +118,7 @@ class RunObserver:
         return {**self.live(), **self._sampler.summary(), "people": self.people()}
 
     def people(self) -> list[dict[str, Any]]:
-        """Return the live quality and the view error of each person who was served, if their true eyes are known."""
+        """Return the live quality and view error of each person served whose true eyes are known."""
         live_db, errors_mm = self._sampler.live_db_of_people, self._lines.people_mm
         return [
             {

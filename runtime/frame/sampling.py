@@ -79,7 +79,7 @@ class QualitySampler:
         self.only_live = False  # if True, only live quality is measured
         self.measured: dict[str, list[float]] = {}  # values for each sampled refresh, keyed by name in FIGURES
         self.live: dict[int, float] = {}  # mean squared error of the light at the true eyes, by refresh number
-        self._people: dict[int, list[float]] = {}  # the same errors, by number of the person; 0: nobody was served
+        self._people: dict[int, list[float]] = {}  # the same errors, by number; 0: not served yet
         self.moment: Moment | None = None  # latest measured refresh, for the stills, contact sheet and viewer page
         self._waiting: deque[_Sample] = deque()
         self._job: BackgroundJob[RefreshQuality] | None = None
@@ -264,7 +264,7 @@ class QualitySampler:
 
     @property
     def live_db_of_people(self) -> dict[int, float]:
-        """Live quality of each person who was served, in dB, by number. Refreshes before the only one count as well."""
+        """Live quality of each person who was served, in dB, by number."""
         people = {number: errors for number, errors in self._people.items() if number}
         if len(people) == 1 and 0 in self._people:
             (number,) = people

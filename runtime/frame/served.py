@@ -44,12 +44,12 @@ def moved_m2(before_m: Eyes, after_m: Eyes) -> float:
 
 
 def sigma_factor(people: int) -> float:
-    """Return the factor for the standard deviation of independent errors in several people's eyes (`moved_m2`)."""
+    """Return the factor for the standard deviation of errors in several people's eyes (`moved_m2`)."""
     return 1.0 if people < 2 else float((1 + UNSHARED) ** 0.5)
 
 
 def accounts_of(solution: Solution | None, eyes: EyesEstimate) -> tuple[PersonAccount, ...]:
-    """Return an account of each person who is served, with the eyes that the shown solution was computed for."""
+    """Return an account of each person who is served, with the eyes that the solution is for."""
     if eyes.eyes_m is None:
         return ()
     numbers, solved = eyes.people or (1,), dict[int, F64]()

@@ -44,7 +44,7 @@ class TrueEyes:
         return bool(self._known) and time_ns > self._known[-1][0] and not self._ended
 
     def meet(self, account: RefreshAccount) -> None:
-        """Note which of the true people somebody is who is served for the first time: the nearest one.
+        """Note who of the true people a person is who is served for the first time: the nearest.
 
         From then on it stays the same one, so that a tracker that took another person's eyes would show.
         """
@@ -61,7 +61,7 @@ class TrueEyes:
                     served.add(place)
 
     def of(self, account: RefreshAccount) -> RefreshAccount:
-        """Return a refresh's account with the true eyes of everybody who is served, where they are known."""
+        """Return a refresh's account with the true eyes of all people served, where they are known."""
         all_m = self.at(account.photon_ns)
         if all_m is None:
             return account

@@ -48,7 +48,7 @@ class Viewer:
         self._captures_ns: deque[int] = deque(maxlen=64)
 
     def adopt(self, settings: Settings, calibration: Calibration) -> None:
-        """Adopt new settings and a new calibration. The trackers are reset only if their settings have changed."""
+        """Adopt new settings and a new calibration. Trackers are reset only if theirs have changed."""
         before, self._settings, self._calibration = self._settings, settings, calibration
         if settings.tracker != before.tracker:
             self._people = self._new_people()

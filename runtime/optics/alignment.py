@@ -57,9 +57,9 @@ def midpoints(eyes_m: Eyes) -> F64:
 
 
 def common_movement_m(before_m: Eyes, after_m: Eyes) -> F64:
-    """Return the (3,) movement that several people share: along each axis, the least, or 0 if they move oppositely.
+    """Return the (3,) movement that people share: along each axis the least, or 0 if they move apart.
 
-    Layers that follow it are exact for whoever moves least. A person at rest keeps a picture at rest.
+    Layers that follow it are exact for the person who moves least. A person at rest keeps a picture at rest.
     """
     moved = midpoints(after_m) - midpoints(before_m)
     least, most = moved.min(axis=0), moved.max(axis=0)

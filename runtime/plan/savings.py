@@ -59,7 +59,7 @@ def seeing_eyes(eyes_m: Eyes, before: tuple[bool, ...]) -> tuple[bool, ...]:
 
 
 def selected_eyes(eyes_m: Eyes, seeing: tuple[bool, ...]) -> F64:
-    """Return the (2P, 3) eyes to solve for. One that cannot see is replaced by the person's other, if that can."""
+    """Return the (2P, 3) eyes to solve for. If one cannot see, the person's other one replaces it."""
     if all(seeing):
         return eyes_m
     other = [eye ^ 1 if not seeing[eye] and seeing[eye ^ 1] else eye for eye in range(len(seeing))]

@@ -74,8 +74,8 @@ def test_hiding_and_missing_faces_never_confuse_two_people(data: st.DataObject) 
         assert true_m is not None
         gone = [who for who, (begin_s, end_s) in missing.items() if begin_s <= time_s < end_s]
         kept = [one for one in sample.people if whose(true_m, one.eyes_m.mean(axis=0)) not in gone]
-        first, *others = kept or [None]
-        shown.append(SensorFrame(sample.sequence, sample.capture_ns, first, true_eyes_m=true_m, others=tuple(others)))
+        first, others = (kept[0] if kept else None), tuple(kept[1:])
+        shown.append(SensorFrame(sample.sequence, sample.capture_ns, first, true_eyes_m=true_m, others=others))
     assert all(len(owner) == 1 for owner in owners(shown, join_s=0.2).values())
 
 
@@ -84,7 +84,7 @@ def test_a_head_that_may_be_either_person_is_given_to_nobody() -> None:
     assert assigned(distance_m, radius_m) == ([None, None], [True, True])
 
 
-def test_a_head_is_given_to_the_person_who_was_there_a_moment_ago() -> None:
+def test_a_head_is_given_to_the_person_who_was_just_there() -> None:
     distance_m, radius_m = np.array([[0.002], [0.11]]), np.array([[0.03], [0.3]])
     assert assigned(distance_m, radius_m) == ([0, None], [False, False])
 

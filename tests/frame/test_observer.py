@@ -180,6 +180,7 @@ def test_nothing_measured_is_null(content: ContentSource, solved: Solution) -> N
     assert observer.summary() == {
         "live_db": None, "view_error_mm": None, "light_db": None, "psnr_db": None, "ssim": None, "carried_db": None,
         "psnr_db_true_eyes": None, "carried_db_true_eyes": None, "quality_frames": 0, "live_frames": 0,
+        "people": [],
     }  # fmt: skip
     assert observer.moment is None
 
@@ -534,7 +535,7 @@ def test_every_nth_refresh_leaves_what_a_judge_needs(content: ContentSource, sol
         true = retina_pictures(content, light["info"]["true_eyes_m"], SMALL, fov_deg=FOV_DEG, time_ns=0)
         assert all(np.array_equal(a, b) for a, b in zip(light["true"], true, strict=True))
         info = light["info"]
-        assert set(info) == {"solved_for_m", "eyes_m", "true_eyes_m", "fov"}
+        assert set(info) == {"solved_for_m", "eyes_m", "true_eyes_m", "fov", "people"}
         assert np.array_equal(info["eyes_m"], aside(number / 500))
         assert np.array_equal(info["solved_for_m"], EYES)
         assert info["true_eyes_m"] == pytest.approx(aside(number / 400))
