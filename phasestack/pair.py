@@ -41,6 +41,7 @@ from runtime.records import F64, U8
 from runtime.support.artifacts import OutputFolder, write_json
 from runtime.support.progress import ShownProgress
 from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG, SEPARATION_MIN_M, refusal
+from runtime.support.untrusted_input import checked_path
 
 EVERY_LEAST = 20  # minimum number of pixels to sample along a picture's shorter side
 STEPS_MOST = 1000  # maximum number of steps of a solution
@@ -178,11 +179,18 @@ class Result:
         told: dict[str, Any] = {"model": self.model, "eye_sigma_mm": self.eye_sigma_mm, "notes": self.notes}
         told["total_ms"] = round(self.total_ms, 3)
         try:
-            with OutputFolder(Path(out)) as folder:
+            with OutputFolder(checked_path(_folder(out))) as folder:
                 self._pair.write(folder.staging, lines=[self._line, *self.notes])
                 write_json(folder.staging / "solve.json", self._pair.quality.table() | told)
         except InputError as error:
             raise ValueError(f"out: {error}") from None
+
+
+def _folder(out: Any) -> str:
+    """Return a folder's path. Raises ValueError for anything else, such as an open file."""
+    if not isinstance(out, str | os.PathLike) or not isinstance(os.fspath(out), str):
+        raise ValueError(f"out: must be a folder, not {type(out).__name__}")
+    return os.fspath(out)
 
 
 def _ghosts(light_db: float, asked: _Pair) -> tuple[str, ...]:

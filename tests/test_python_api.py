@@ -82,6 +82,22 @@ def test_a_process_forked_during_a_solution_solves() -> None:
         thread.join()
 
 
+@pytest.mark.parametrize(
+    ("out", "said"),
+    [
+        (None, "out: must be a folder, not NoneType"),
+        (io.BytesIO(), "out: must be a folder, not BytesIO"),
+        (b"out", "out: must be a folder, not bytes"),
+        ("a\0b", "out: .*NUL"),
+    ],
+)
+def test_what_is_no_folder_is_refused_by_name(out: Any, said: str) -> None:
+    small: Any = picture()[:36, :64]
+    stack = replace(STACK, width_px=64, height_px=36)
+    with pytest.raises(ValueError, match=said):
+        phasestack.solve(small, small, eyes_m=EYES, stack=stack, model="fast").save(out)
+
+
 def test_light_of_a_large_picture_is_of_some_pixels_with_its_error(monkeypatch: pytest.MonkeyPatch) -> None:
     given: Any = (picture(), picture(3))
     whole = phasestack.solve(*given, eyes_m=EYES, stack=STACK, model="fast").quality
