@@ -122,9 +122,7 @@ class _Problem:
         return np.asarray(seen.reshape(-1, 2) - self.image_px, dtype=np.float64)
 
     def residuals(self, state: _State) -> F64:
-        """Return a vector (2K + priors,) of `residual_px` and the lens's deviations from its prior, in
-        standard deviations.
-        """
+        """Return a vector (2K + priors,) of `residual_px` and the lens's deviations, in prior sigmas."""
         lens = state.lens
         prior = np.concatenate([[lens[0] - lens[1]], lens[2:4] - self.middle, lens[4:]]) * self.prior_scale
         return np.concatenate([self.residual_px(state).ravel(), prior])

@@ -52,9 +52,7 @@ class EyeWindow:
             self._samples.popleft()
 
     def measure(self) -> tuple[F64, float] | None:
-        """Return the median position (3,) in the sensor frame and the RMS scatter around it, in metres, or
-        None if too few.
-        """
+        """Return the median position (3,) in `sensor` and the RMS scatter, in metres, or None if too few."""
         if len(self._samples) < MIN_SAMPLES:
             return None
         points = np.array([point for _, point in self._samples])
@@ -76,9 +74,7 @@ class Walk:
         say: Callable[[str], None],
         chart: Callable[[Viewpoint], None] | None = None,
     ) -> None:
-        """Start with the first viewpoint, in order, that has no pair in `file` yet. `chart` shows a viewpoint's chart,
-        if given.
-        """
+        """Start with the first viewpoint that has no pair in `file` yet. `chart` shows a viewpoint's chart."""
         self._file, self._say, self._chart = file, say, chart
         self._left = [v for v in viewpoints if v.name not in file.viewpoints]
         self._window = EyeWindow()

@@ -192,9 +192,7 @@ def _samples(picture: U8, points: F64) -> F64:
 
 
 def _edge_px(picture: U8, quad: F64) -> float:
-    """Return the width of a marker's outer edge in pixels, a measure of blur: contrast over slope, median of four
-    sides.
-    """
+    """Return the width of a marker's edge in pixels, for blur: contrast over slope, median of four sides."""
     widths = []
     centre = quad.mean(axis=0)
     for first, second in zip(quad, np.roll(quad, -1, axis=0), strict=True):

@@ -127,9 +127,7 @@ class SetupHardware:
         return f"{settings.sensor.driver} {worker.serial}".strip()
 
     def sample(self, standing_at: Viewpoint) -> Sample | None:
-        """Return the sensor's next sample, queued while panels were slow, or None. Only the simulation uses
-        `standing_at`.
-        """
+        """Return the sensor's next sample, or None. Only the simulation uses `standing_at`."""
         if self._worker is None:
             return None
         if self._worker.error is not None:

@@ -30,9 +30,7 @@ def _block(channels: int, middle: int, out: int) -> nn.Sequential:
 
 
 class Up(nn.Module):
-    """A decoder stage: double the input (bilinear, aligned corners), pad it to the skip connection's
-    size, join, convolve.
-    """
+    """A decoder stage: double the input, pad it to the skip connection's size, join and convolve."""
 
     def __init__(self, channels: int, out: int) -> None:
         super().__init__()

@@ -77,9 +77,7 @@ def picture_cases(contract: Contract, height: int, width: int) -> dict[str, Feed
 
 
 def picture_feeds(pictures: tuple[F32, F32], contract: Contract, panels: int) -> Feeds:
-    """Return a picture network's named input (1, 6·panels, h, w), by panel, then eye, then RGB, for
-    intensities (h, w, 3).
-    """
+    """Return a picture network's named input (1, 6·panels, h, w), by panel, eye, RGB, for intensities."""
     if contract.input_value == "phase":
         left, right = (phase_from_intensity(picture, contract.branch) for picture in pictures)
         pictures = left, right

@@ -27,9 +27,7 @@ class Unrolled(nn.Module):
         self.step_momenta = nn.Parameter(torch.full((steps,), MOMENTUM))
 
     def forward(self, eyes: Tensor) -> Tensor:
-        """Map intensities (n, 6, h, w) to equal panel values (n, 9, h, w): a third of the phase sum, 1 to 2,
-        of the mean.
-        """
+        """Map intensities (n, 6, h, w) to equal panel values (n, 9, h, w) that show the mean picture."""
         mean = (eyes[:, :3] + eyes[:, 3:]) / 2
         phase = torch.asin(mean.clamp(0, 1).sqrt()) * (2 / torch.pi)
         return ((2 - phase) / 3).repeat(1, 3, 1, 1)

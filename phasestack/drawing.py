@@ -103,9 +103,7 @@ class DrawingClient:
     """Connection of an application that draws, restored by itself. No method waits."""
 
     def __init__(self, address: str, *, name: str) -> None:
-        """Start connecting to an address, or "" to look for it; the log has `name`. Raises InputError without
-        websockets.
-        """
+        """Start connecting to an address, or "" to look for it. Raises InputError without websockets."""
         try:
             from websockets.sync import client
         except ImportError as error:

@@ -161,9 +161,7 @@ class Result:
         return line + f"PSNR with one ray per pixel, as published: {self._pair.quality.psnr_db:.1f} dB"
 
     def show(self) -> Path:
-        """Open a browser page of the layers and the eyes' views, and return its temporary HTML file, which is
-        not deleted.
-        """
+        """Open a browser page of layers and views, and return its temporary HTML file, which stays."""
         path = Path(tempfile.mkdtemp(prefix="phasestack-")) / "viewer.html"
         path.write_text(self._pair.viewer([self._line, *self.notes]), encoding="utf-8")
         webbrowser.open(path.as_uri())
@@ -434,9 +432,7 @@ def project(
 
 
 def _named(left: Any, right: Any) -> dict[str, Any]:
-    """Return the given pictures by the names to use in error messages. Raises ValueError for no sequence or their
-    number.
-    """
+    """Return the given pictures by the names to use in error messages. Raises ValueError for their number."""
     if right is not None:
         return {"left": left, "right": right}
     if not isinstance(left, Sequence) and getattr(left, "ndim", 0) != 4:

@@ -51,9 +51,7 @@ class SimulatedClock:
 
 
 class Stopwatch:
-    """Adds up the real time spent in named stages, in ms, in `stage_ms`. A stage ends with a `lap` of its
-    name.
-    """
+    """Adds up the real time of named stages, in `stage_ms`. A stage ends with a `lap` of its name."""
 
     def __init__(self, *stages: str) -> None:
         """Start the first stage. `stages` are listed in `stage_ms` even if they never occur."""

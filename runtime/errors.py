@@ -79,9 +79,7 @@ class TransientError(PhasestackError):
 
 
 class SensorLost(TransientError):
-    """The sensor is disconnected, hangs or delivers invalid data. It is reopened, after longer and longer
-    delays.
-    """
+    """The sensor is disconnected, hangs or delivers invalid data. It is reopened, later and later."""
 
 
 class SensorTimeout(TransientError):

@@ -54,9 +54,7 @@ class Intrinsics:
 
     @classmethod
     def centred(cls, width_px: int, height_px: int, *, fov_rad: float) -> Intrinsics:
-        """Return the intrinsics of a camera with square pixels, a centred principal point and horizontal
-        `fov_rad`.
-        """
+        """Return the intrinsics of a centred camera with square pixels and horizontal `fov_rad`."""
         focal_px = width_px / 2 / math.tan(fov_rad / 2)
         return cls(width_px, height_px, focal_px, focal_px, width_px / 2, height_px / 2)
 

@@ -128,7 +128,7 @@ for _name, _meaning in PLAIN.items():
 
 
 def tell(request: dict[str, Any], config: Path | None) -> None:
-    """Send a request and print the new state. Exits with 1 without a daemon; raises InputError if
+    """Send a request and print the new state. Exits with 1 without a daemon. Raises InputError if
     refused.
     """
     from runtime.daemon.client import ANSWERED_WITHIN_S, NotRunning, ask, sockets

@@ -104,9 +104,7 @@ def asked_for(files: Files, eyes: Eyes, panels: Path | None) -> Asked:
 
 
 def case_asked_for(case: Path, others: list[str]) -> Asked:
-    """Read a case file. Raises InputError if it cannot be used, or with `others`, options that it
-    replaces.
-    """
+    """Read a case file. Raises InputError if it is invalid, or with `others`, options that it replaces."""
     if others:
         raise InputError("solve", others[0], "is part of the case file; omit it, or omit --case")
     pair = read_case(case)
@@ -227,9 +225,7 @@ def taken(pictures: list[Any], eyes: Eyes, stack: PanelStack) -> tuple[list[Any]
 
 
 def checked_eyes(left_eye: tuple[float, ...], right_eye: tuple[float, ...], stack: PanelStack) -> F64:
-    """Return the eyes (2, 3). Raises InputError if they are not in front of the panels, or too close
-    together.
-    """
+    """Return the eyes (2, 3). Raises InputError if they are not in front, or too close together."""
     for option, eye in (("--left-eye", left_eye), ("--right-eye", right_eye)):
         if eye[0] <= max(stack.x_m):
             raise InputError(

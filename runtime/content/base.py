@@ -60,9 +60,7 @@ class ContentSource(ABC):
     draws_in: object = None  # GL context that owns the textures `draw` returns, or None if the source returns arrays
 
     def __init__(self, options: Any, *, stack: Any, context: Any) -> None:
-        """Create a user-defined scene, given an instance of `Options` and the display's `PanelStack`. Raises InputError
-        if the scene cannot be shown.
-        """
+        """Create a scene, given its `Options` and the display's `PanelStack`. Raises InputError."""
         self.info = ContentInfo(type(self).__name__, moving=True, background=None)
 
     @abstractmethod
@@ -94,15 +92,11 @@ class ContentSource(ABC):
         return None
 
     def expect(self, views: Sequence[View], *, time_ns: int) -> None:  # noqa: B027 - most have nothing to prepare
-        """Prepare for the views that will be drawn next, usually one for each eye. Raises ContentFailure if
-        that fails for now.
-        """
+        """Prepare for the views to be drawn next, usually one per eye. Raises ContentFailure for now."""
 
     @property
     def program(self) -> dict[str, Any] | None:
-        """Return the `address` that a drawing program connects to and its recent `frame_ms`, or None if there
-        is no program.
-        """
+        """Return a drawing program's `address` and recent `frame_ms`, or None without a program."""
         return None
 
     def extent(self, view: View, *, time_ns: int) -> PixelRect | None:
@@ -123,9 +117,7 @@ class ContentSource(ABC):
 
     @property
     def problem(self) -> str:
-        """Describe the current fault in one line, or return an empty string. The last good picture stays on
-        the display.
-        """
+        """Describe the current fault in one line, or return "". The last good picture stays."""
         return ""
 
     def close(self) -> None:  # noqa: B027 - most sources hold nothing

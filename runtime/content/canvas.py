@@ -116,9 +116,7 @@ class CanvasSource(ContentSource):
     """
 
     def __init__(self, context: Any, *, info: ContentInfo, samples: int = 0, deep: bool = False) -> None:
-        """Create the source; `samples` is 0 for no multisampling. `deep` draws in half floats, for blending many layers
-        when some are brighter than white.
-        """
+        """Create the source; 0 `samples` for no multisampling, `deep` for half floats (brighter than white)."""
         self.info, self.context = info, context
         self.draws_in = context
         self.held: list[Any] = []  # GL objects released together with the source

@@ -131,9 +131,7 @@ def _four_bytes(turns: U32) -> F32:
 
 
 def _sog(path: Path) -> Gaussians:
-    """Read a SOG file or folder: pictures with one pixel per splat, whose bytes are fractions of a range or codebook
-    indices.
-    """
+    """Read a SOG file or folder: pictures of a pixel per splat, in fractions of a range or codebook indices."""
     with _SogFiles(path) as files:
         meta = untrusted_input.parsed_json(files.read("meta.json"), source=path)
         if meta.get("version") != 2:

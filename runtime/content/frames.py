@@ -49,9 +49,7 @@ class Frames(ABC):
 
     @abstractmethod
     def frame(self, index: int) -> U8:
-        """Return the frame at `index`, with every view in the layout, as RGB (h, w, 3). Raises ContentFailure
-        if that fails.
-        """
+        """Return the frame at `index`, with every view in the layout, RGB (h, w, 3). Raises ContentFailure."""
 
     def layout(self, index: int) -> Layout:
         return self.layouts[min(index, len(self.layouts) - 1)]

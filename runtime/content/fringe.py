@@ -75,9 +75,7 @@ class OutlineRamps:
     """Builds ramps along outlines: quadrilaterals whose coverage falls to 0 outside the outline."""
 
     def __init__(self, parts: Mapping[int, tuple[Edges, F32]]) -> None:
-        """Prepare ramps for parts, by number: edges, and vertices (v, 12) of a position in the part's frame and
-        attributes.
-        """
+        """Prepare ramps for parts, by number: edges, and vertices (v, 12) of positions and attributes."""
         self._parts = {number: _outlined(*part) for number, part in parts.items()}
         self._ramps = np.empty((sum(len(edges.faces) for edges, _ in parts.values()), 4, CORNER_FLOATS), np.float32)
 

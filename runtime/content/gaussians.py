@@ -176,9 +176,7 @@ def of_points(places: F32, colours: F32) -> Gaussians:
 
 
 def bounds(gaussians: Gaussians) -> tuple[F64, F64]:
-    """Return the lowest and highest corner (3,) of the splats, including two deviations but not faint
-    splats and outliers.
-    """
+    """Return the lowest and highest corner (3,) of the splats, without faint splats and outliers."""
     seen = gaussians.opacities > FAINT
     seen = seen if seen.any() else np.ones_like(seen)
     centres = gaussians.centres[seen].astype(np.float64)
@@ -189,9 +187,7 @@ def bounds(gaussians: Gaussians) -> tuple[F64, F64]:
 
 
 def covariances_of(scales: F32, quaternions: F32) -> F32:
-    """Return the covariances R diag(s²) R^T, packed as (n, 6), of deviations s (n, 3) and quaternions (n,
-    4), w, x, y, z.
-    """
+    """Return covariances R diag(s²) R^T, packed as (n, 6), of deviations s and quaternions w, x, y, z."""
     packed = np.empty((len(scales), 6), np.float32)
     for first in range(0, len(scales), AT_ONCE):
         rows = slice(first, first + AT_ONCE)
@@ -282,9 +278,7 @@ def nearest_blocks(splats: Splats, view: View, *, every: int, first: tuple[int, 
 
 
 def harmonic_basis(directions: F32, count: int) -> F32:
-    """Return the first `count` real spherical harmonics (n, count) for unit directions (n, 3), in the
-    reference's order.
-    """
+    """Return the first `count` real spherical harmonics (n, count) for unit directions (n, 3)."""
     x, y, z = directions.T
     basis = [np.full_like(x, FLAT_HARMONIC)]
     if count > 1:
@@ -309,9 +303,7 @@ def harmonic_basis(directions: F32, count: int) -> F32:
 
 
 def colours_towards(harmonics: F32, directions: F32) -> F32:
-    """Return the colours (n, 3), clipped at 0, of harmonics (n, k, 3) in unit directions (n, 3) from the
-    eye, in their frame.
-    """
+    """Return the colours (n, 3), clipped at 0, of harmonics (n, k, 3) in unit directions from the eye."""
     if harmonics.shape[1] == 1:
         return np.asarray(np.maximum(harmonics[:, 0] * np.float32(FLAT_HARMONIC) + np.float32(0.5), 0))
     basis = harmonic_basis(directions, harmonics.shape[1])

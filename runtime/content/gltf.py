@@ -255,9 +255,7 @@ class GltfScene:
         return values, np.asarray(decoded.faces).reshape(-1)
 
     def _look(self, index: int | None) -> tuple[dict[str, Any], Table]:
-        """Convert a material to `Part` fields, with linear colours, and return its texture reference, which names
-        coordinates.
-        """
+        """Convert a material to `Part` fields, with linear colours, and return its texture reference."""
         file, material = self.file, {} if index is None else self.file.item("materials", index)
         own = material.get("extensions", {})
         base, prefix = material.get("pbrMetallicRoughness", {}), "baseColor"
@@ -315,9 +313,7 @@ def _local(node: Table) -> F64:
 
 
 def _faces(corners: Array, mode: int) -> Array:
-    """Group indices into triangles (t, 3), lines (n, 2) or points (n,) (section 3.7.2.1). Raises ValueError for other
-    modes.
-    """
+    """Group indices into triangles (t, 3), lines (n, 2) or points (n,) (3.7.2.1), or raise ValueError."""
     corners = np.asarray(corners).astype(np.int64)
     if mode == POINTS:
         return corners

@@ -75,9 +75,7 @@ class GltfFile:
         return _count(self.item("accessors", accessor))
 
     def accessor(self, index: int, *, rows: Array | None = None, as_float: bool = True) -> Array:
-        """Return an accessor's elements (n, ...), all or those of `rows`, as float32 by `fractions` unless
-        `as_float` is False.
-        """
+        """Return an accessor's elements (n, ...), or those of `rows`, as float32 by `fractions` or as stored."""
         accessor = self.item("accessors", index)
         values = self._stored(accessor)
         if "sparse" in accessor:
@@ -145,9 +143,7 @@ class GltfFile:
             raise ValueError(f"a data URI is not valid base64: {error}") from None
 
     def picture(self, texture: Table) -> U8:
-        """Return a texture's picture as RGBA (h, w, 4). Call `check_pictures` first. Raises InputError if it
-        cannot be decoded.
-        """
+        """Return a texture as RGBA (h, w, 4), after `check_pictures`. Raises InputError."""
         number = self._image_of(texture)
         if number not in self._pictures:
             image = decoded_picture(self._coded(number), source=self.path, field="texture", name=f"images[{number}]")
@@ -166,9 +162,7 @@ class GltfFile:
             untrusted_input.within(pixels, LIMITS.texture_pixels, source=self.path, field="textures' pixels")
 
     def _image_of(self, texture: Table) -> int:
-        """Return the number of a texture's image, preferring formats added by extensions. Raises InputError if none is
-        supported.
-        """
+        """Return the number of a texture's image, preferring formats added by extensions. Raises InputError."""
         own: Table = texture.get("extensions", {})
         for offered in (*(own[name] for name in PICTURE_EXTENSIONS if name in own), texture):
             if offered.get("source") is not None:

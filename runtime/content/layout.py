@@ -153,9 +153,7 @@ def _span_deg(path: Path) -> int:
 
 
 def hint(picture: U8) -> str:
-    """Return a picture's probable layout, or an empty string: its halves may be views if they correlate
-    after a small shift.
-    """
+    """Return a picture's probable layout, or "": halves that correlate after a small shift may be views."""
     for layout in ("side-by-side", "top-bottom"):
         columns = 2 if layout == "side-by-side" else 1
         if min(picture.shape[0] * columns, picture.shape[1] * (3 - columns)) < 4 * SMALL_PX[0]:

@@ -72,9 +72,7 @@ def prepare(file: SceneFile) -> Callable[..., ContentSource]:
 
 
 def load_mesh(path: Path) -> MeshData:
-    """Read a mesh file. Raises InputError if it is damaged, exceeds a limit, is not finite, or contains
-    nothing to draw.
-    """
+    """Read a mesh file. Raises InputError if it is damaged, empty, not finite or exceeds a limit."""
     progress.tell(f"reading {path.name}", 0)
     data = untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)
     _check_counts(path, data)

@@ -101,9 +101,7 @@ def _between(share: F32, low: F32, high: F32) -> F32:
 
 
 def _turns(packed: U32) -> F32:
-    """Decode packed words (n,) into quaternions (n, 4), w, x, y, z; the top two bits name the component that is not
-    stored.
-    """
+    """Decode words (n,) into quaternions (n, 4), w, x, y, z; the top two bits name the missing component."""
     return with_largest((fields_of(packed, (10, 10, 10)) - np.float32(0.5)) * np.float32(np.sqrt(2)), packed >> 30)
 
 

@@ -88,9 +88,7 @@ def coded(light: ArrayLike) -> F32:
 
 
 def merged(parts: Sequence[Part]) -> list[Part]:
-    """Merge parts with equal materials, whose colours and opacities become vertex colours, up to
-    `OUTLINED_MAX` triangles.
-    """
+    """Merge parts with equal materials, up to `OUTLINED_MAX` triangles, with vertex colours."""
     alike: dict[tuple[object, ...], list[list[Part]]] = {}
     counts: dict[tuple[object, ...], int] = {}  # triangles in the last group
     for part in parts:

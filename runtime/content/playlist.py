@@ -119,9 +119,7 @@ class PlaylistSource(ForwardingSource):
         return self._sources[self._number % len(self._sources)]
 
     def describe(self, *, time_ns: int) -> dict[str, Any]:
-        """Return the status: `entries` (scenes and durations), `index` (current) and `left_s` (None if the
-        scene stays).
-        """
+        """Return `entries` (scenes and durations), `index` and `left_s` (None if the scene stays)."""
         entries = [{"scene": entry.scene, "seconds": entry.seconds} for entry in self._list.entries]
         index, since_ns = self._at(time_ns)
         left_s = self._list.entries[index % len(entries)].seconds - since_ns / NS_PER_S

@@ -52,9 +52,7 @@ class PlyHeader:
 
 
 def read_header(path: Path) -> PlyHeader:
-    """Read a PLY file's header. Raises InputError if it is missing, incomplete or not understood, or if a
-    count exceeds a limit or the file's size.
-    """
+    """Read a PLY file's header. Raises InputError if it is missing, incomplete or exceeds a limit."""
     with untrusted_input.open_regular(path, most_bytes=LIMITS.file_bytes) as file:
         head = file.read(LONGEST_HEADER)
         size = file.seek(0, 2)

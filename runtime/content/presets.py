@@ -30,9 +30,7 @@ def preset_names() -> tuple[str, ...]:
 
 
 def stack_from_preset(name: str) -> F64:
-    """Return the 4x4 map from scene units to metres in `stack` (supplement): R · p / (100 r_p2d) + t,
-    r_p2d in units per cm.
-    """
+    """Return the 4x4 map from scene units to metres in `stack`: R · p / (100 r_p2d) + t (supplement)."""
     table, matrix = preset_file()["scene"][name], np.eye(4)
     rotation = rotation_matrix(table["rotation_deg"], preset_file()["rotation_order"])
     matrix[:3, :3] = rotation / (table["scale_per_cm"] / CM)
@@ -56,9 +54,7 @@ def drawn_scene_from_stack(name: str) -> F64:
 
 
 def rotation_matrix(angles_deg: Triple, order: str) -> F64:
-    """Return the 3x3 rotation by angles about x, y and z, about fixed (`xyz`) or moving axes (`XYZ`), as
-    SciPy orders them.
-    """
+    """Return the 3x3 rotation about fixed (`xyz`) or moving axes (`XYZ`), as SciPy orders them."""
     angles = [angles_deg["xyz".index(letter)] for letter in order.lower()]
     return np.asarray(Rotation.from_euler(order, angles, degrees=True).as_matrix())
 

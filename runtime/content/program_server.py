@@ -127,9 +127,8 @@ class _Form:
         return ProgramPicture(pixels[:: self._order], self._depth_in(data[end:]))
 
     def picture(self, data: memoryview) -> ProgramPicture:
-        """Return the raw picture in a message or in shared memory, without copying it.
-
-        Raises ValueError if the data has the wrong size.
+        """Return the raw picture in a message or in shared memory, without copying it. Raises ValueError if
+        the data has the wrong size.
         """
         if len(data) != self.bytes:
             parts = "RGBA pixels" if self.depth is None else f"RGBA pixels and {self.depth.name} depths"
@@ -328,9 +327,7 @@ class ProgramServer:
         )
 
     def ask(self, asked: AskedViews) -> int:
-        """Request a frame's pictures, and return its number. Raises ContentFailure without a program or with
-        too many unanswered.
-        """
+        """Request a frame's pictures, and return its number. Raises ContentFailure."""
         now_s = time.monotonic()
         with self._changed:
             self._count += 1

@@ -45,9 +45,7 @@ Mask = NDArray[np.bool_]
 
 
 def split_rgbd(rgb: U8, path: Path) -> tuple[U8, F32]:
-    """Split a picture into colour (left half) and depth (right half). Raises InputError if it is too
-    small, or if the right half is not grey.
-    """
+    """Split a picture into colour (left half) and depth. Raises InputError if the right is not grey."""
     width = rgb.shape[1] // 2
     if width < 2 or rgb.shape[0] < 2:
         raise InputError(path, "layout", "the picture is too small to contain colour and depth side by side")
@@ -92,9 +90,7 @@ def sharpened(depth: F32) -> F32:
 
 
 def unmixed(colour: U8, depth: F32) -> U8:
-    """Replace colours next to depth edges, which may mix both sides, by those of pixels farther from the
-    edge on each side.
-    """
+    """Replace colours next to depth edges, which may mix both sides, by colours farther from the edge."""
     side = 2 * MIXED_PX + 1
     kernel = np.ones((side, side), np.uint8)
     mixed = cv2.dilate(depth, kernel) - cv2.erode(depth, kernel) > TORN_RELATIVE
@@ -126,9 +122,7 @@ def background(depth: F32, colour: U8) -> tuple[F32, U8, Mask]:
 
 
 def _quads(depth: F32) -> I32:
-    """Divide a depth map into quads (n, 4) of flat indices, large in smooth areas, single pixels at edges, none across
-    them.
-    """
+    """Divide a depth map into quads (n, 4) of flat indices, large in smooth areas, none across edges."""
     rows, columns = depth.shape
     step = -(-columns // COLUMNS)
     down = np.unique(np.r_[np.arange(0, rows - 1, step), rows - 1])

@@ -170,9 +170,7 @@ def _shape(positions: F64, normals: F64, uv: F64, triangles: I32) -> Shape:
 
 
 def card(width_m: float, height_m: float, *, repeat: tuple[float, float] = (1.0, 1.0)) -> Shape:
-    """Return a rectangle, width along y and height along z, in x = 0. From +x, its repeated texture is
-    upright and unmirrored.
-    """
+    """Return a rectangle in x = 0, width along y, whose repeated texture is upright from +x."""
     s, t, triangles = _grid(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
     positions = np.column_stack([0 * s, (s - 0.5) * width_m, (0.5 - t) * height_m])
     return _shape(
@@ -203,9 +201,7 @@ def sphere(radius_m: float, *, columns: int = 48, rows: int = 24) -> Shape:
 
 
 def torus(radius_m: float, tube_m: float, *, columns: int = 64, rows: int = 24) -> Shape:
-    """Return a torus around the x axis; `radius_m` is from its centre to the tube's, `columns` are
-    segments around the axis.
-    """
+    """Return a torus around the x axis; `columns` are segments around the axis, `rows` around the tube."""
     s, t, triangles = _grid(np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1))
     around, across = s * 2 * np.pi, t * 2 * np.pi
     normal = np.column_stack([np.sin(across), np.cos(around) * np.cos(across), np.sin(around) * np.cos(across)])
@@ -219,9 +215,7 @@ def _runs(marks: str) -> list[tuple[int, int]]:
 
 
 def lettering(text: str, *, cell_m: float, depth_m: float) -> Shape:
-    """Return text of `GLYPHS` in solid letters of 5 x 7 cells, one cell apart, centred on the origin and
-    readable from +x.
-    """
+    """Return text of `GLYPHS`, solid letters of 5 x 7 cells, one cell apart, readable from +x."""
     left = -(len(text) * 6 - 1) / 2
     bars = []
     for index, letter in enumerate(text):

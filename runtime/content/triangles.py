@@ -1,6 +1,4 @@
-"""Draw textured, coloured and lit triangles with OpenGL, by shaders with only the features each part
-needs.
-"""
+"""Draw textured, coloured and lit triangles by OpenGL shaders with only the features needed."""
 
 from __future__ import annotations
 

@@ -117,9 +117,7 @@ class Host(Supervisor):
     recorder: Any = None  # additional observer; its `watches` is called before the first refresh
 
     def starting(self, doing: str) -> bool:
-        """Report a startup step, such as "opening panels". Returning False cancels the loading of content and
-        model.
-        """
+        """Report a startup step, such as "opening panels". False cancels loading content and model."""
         return True
 
     def wait_for_panel(self, why: str) -> bool:

@@ -145,9 +145,7 @@ class DaemonClient:
         self._answers: dict[str, tuple[float, dict[str, Any]]] = {}
 
     def look_up(self, name: str) -> dict[str, Any]:
-        """Return the possibly cached answer to `status`, `pictures`, `log` or `about`, with `ok` False if
-        none.
-        """
+        """Return the maybe cached answer to `status`, `pictures`, `log` or `about`; its `ok` may be False."""
         with self._locks[name]:
             asked_s, answer = self._answers.get(name, (float("-inf"), {}))
             if time.monotonic() - asked_s < LOOKED_UP_AGAIN_S[name]:

@@ -44,9 +44,7 @@ class Command:
 
 
 def parse(request: Any) -> Command:
-    """Return the command in a request from the socket. Raises ValueError, with one line, if it is
-    invalid.
-    """
+    """Return the command in a request. Raises ValueError, with one line, if it is invalid."""
     if not isinstance(request, dict):
         raise ValueError("a request must be one JSON object")
     name, value = request.get("command"), request.get("value")

@@ -83,9 +83,7 @@ def _unseen(layers: U8, account: RefreshAccount, run: Run, settings: Settings) -
 def print_summary(
     summary: dict[str, Any], out: Path | None, *, asked: int | None = None, verbose: bool = False
 ) -> None:
-    """Print a run's result, with one or all figures, and where to look at it. `asked` is the number of
-    refreshes requested, by default all.
-    """
+    """Print a run's result, of `asked` refreshes if given, with one or all figures."""
     if verbose:
         _print_figures(summary)
     for line in headline_lines(summary, asked=asked):

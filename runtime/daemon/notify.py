@@ -18,9 +18,7 @@ class Notifier:
     """Sends the daemon's status and watchdog messages to systemd. Its methods never block or raise."""
 
     def __init__(self, clock: Clock, environment: Mapping[str, str] = os.environ) -> None:
-        """Connect to systemd, whose variables give the watchdog period (see sd_watchdog_enabled), if it runs this
-        process.
-        """
+        """Connect to systemd, whose variables give the watchdog period, if it runs this process."""
         self._clock = clock
         self._channel: Any = None
         if "NOTIFY_SOCKET" in os.environ:  # without this variable, sdnotify would leave a socket open

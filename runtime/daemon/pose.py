@@ -40,9 +40,7 @@ class PoseSender:
     """Observer of the loop that sends the pose of a tracked viewer."""
 
     def __init__(self, settings: PoseSettings) -> None:
-        """Open the socket and the LSL stream. Raises InputError if the host's name is unknown, and MissingPart if LSL
-        is wanted but not installed.
-        """
+        """Open the socket and the LSL stream. Raises InputError for the host, and MissingPart without LSL."""
         self._settings = settings
         self._stream = _lsl_stream(settings) if settings.lsl else None
         self._socket: socket.socket | None = None

@@ -140,9 +140,7 @@ def about(run: Run) -> dict[str, Any]:
 
 
 def library_scenes(settings: ContentSettings) -> tuple[str, ...]:
-    """List at most `LIBRARY_MOST` paths of scenes in the library folder, without those that are not
-    UTF-8.
-    """
+    """List at most `LIBRARY_MOST` paths of scenes in the library folder, those in UTF-8."""
     if not settings.library:
         return ()
     try:

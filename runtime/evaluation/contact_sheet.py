@@ -42,9 +42,7 @@ class Moment:
 
 
 def contact_sheet(layers: U8, eye_views: EyeViews | None, *, headline: str, lines: Sequence[str] = ()) -> U8:
-    """Draw a contact sheet (h, w, 3): a row of layers, then for each eye, if given, target, retina image
-    and error. Long lines of text are wrapped.
-    """
+    """Draw a sheet (h, w, 3): a row of layers, then each eye's target, retina image and error."""
     height, width = layers.shape[1:3]
     tile = (TILE_WIDTH, round(TILE_WIDTH * height / width))
     names = {0: "layer 0 (rear, at the backlight)", len(layers) - 1: f"layer {len(layers) - 1} (front)"}

@@ -37,9 +37,7 @@ class EyeViews:
     fov_deg: float  # horizontal field of view of the images and targets
 
     def viewer(self, layers: U8, text: Sequence[str], *, relief: F32 | None = None) -> str:
-        """Return an HTML viewer page of the first viewer's views, for layers solved for `eyes_m`, and their
-        relief (h, w).
-        """
+        """Return an HTML viewer page of the first viewer's views, for layers solved for `eyes_m`."""
         shown = [0, min(1, len(self.wanted) - 1)]  # the page shows the first viewer's eyes
         wanted, eyes_m = [as_codes(intensities(self.wanted[n])) for n in shown], np.asarray(self.eyes_m)[shown]
         return viewer_html(layers, wanted, self.stack, eyes_m=eyes_m, fov_deg=self.fov_deg, text=text, relief=relief)

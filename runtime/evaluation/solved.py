@@ -71,9 +71,7 @@ class SolvedPair:
         return self._measured(self.eye_views, sigmas_mm=SIGMAS_MM, every=every)
 
     def sampled(self, *, sigmas_mm: Sequence[float], every: int) -> PairQuality:
-        """Measure quality, without SSIM, of every `every`-th pixel and row, with light's standard error
-        unless all count.
-        """
+        """Measure quality, without SSIM, of every `every`-th pixel and row, with light's standard error."""
         views = displayed(
             self.layers, self.pictures, self.stack, eyes_m=self.eyes_m, fov_deg=self.fov_deg, similarity=False
         )

@@ -95,9 +95,7 @@ class Calibration:
         )
 
     def position_error_m(self, stack_m: ArrayLike) -> F64 | None:
-        """Return the calibration's RMS error in metres at points (..., 3) in `stack`, or None if the file has
-        no covariance.
-        """
+        """Return the RMS error in metres at points (..., 3) in `stack`, or None without a covariance."""
         if self.file.covariance is None:
             return None
         jacobian = position_jacobian(stack_m, pivot_m=self.file.covariance.pivot_m)

@@ -120,9 +120,7 @@ def true_eyes(motion: str, times_s: F64, *, path: Path = BENCHMARK_PATH) -> F64:
 
 
 def facing_eyes(middle_m: F64, *, roll: F64) -> F64:
-    """Return the (n, 2, 3) eyes of heads that face the display, of midpoints (n, 3) and tilts (n,) in
-    rad.
-    """
+    """Return the (n, 2, 3) eyes of heads that face the display, of midpoints (n, 3) and roll (n,)."""
     yaw = np.arctan2(middle_m[:, 1], middle_m[:, 0])
     across = [-np.sin(yaw) * np.cos(roll), np.cos(yaw) * np.cos(roll), np.sin(roll)]
     half = IPD_M / 2 * np.stack(across, 1)

@@ -1,6 +1,4 @@
-"""Detect points that cannot be eyes, such as points in millimetres or behind the display, without a
-clock.
-"""
+"""Detect points that cannot be eyes, such as points in millimetres or behind the display."""
 
 from __future__ import annotations
 
@@ -74,9 +72,7 @@ class RefusalWatch:
         return self._counts
 
     def update(self, reason: str) -> str:
-        """Count a sample, refused for a reason or accepted (""). Return a line to log if the warning has
-        changed, or "".
-        """
+        """Count a sample, refused or accepted (""). Return a line to log if the warning has changed, or ""."""
         self._last.append(reason if reason in MISTAKES else "")
         if reason:
             self._counts[reason] += 1

@@ -152,9 +152,7 @@ class Tracker:
         panel_m: tuple[float, float] = PANEL_M,
         in_front_m: float = 0.0,
     ) -> None:
-        """Create a tracker of eyes with x > `in_front_m`; the panels' width and height determine the weight of depth
-        errors.
-        """
+        """Create a tracker of eyes with x > `in_front_m`; `panel_m` determines the weight of depth errors."""
         self.settings = settings or TrackerSettings()
         self._panel_m, self._in_front_m = panel_m, in_front_m
         self._measured = NoiseWatch()
@@ -201,10 +199,9 @@ class Tracker:
         return bool(self._history) and self._history[-1].head.samples >= ESTABLISHED
 
     def reach_m(self, points: EyePoints, *, capture_ns: int) -> tuple[float, float] | None:
-        """Return how far a sample is from the head's expected position, and how far it may be.
-
-        Returns None if it is not the same head, because it is too far away, does not continue the head's motion, or the
-        head was not seen for longer than `IDENTITY_S`.
+        """Return how far a sample is from the head's expected position, and how far it may be. Returns None
+        if it is not the same head, because it is too far away, does not continue the head's motion, or the head was not
+        seen for longer than `IDENTITY_S`.
         """
         if not self._history:
             return None
@@ -227,9 +224,7 @@ class Tracker:
         self._newest_ns, self._asked_ns = -1, 0
 
     def _noise(self, points: EyePoints) -> F64:
-        """Return the (3, 3) covariance of the eyes' midpoint, in m²: the driver's, raised to a minimum, or the
-        settings'.
-        """
+        """Return the (3, 3) covariance of the eyes' midpoint, in m²: the driver's, raised, or the settings'."""
         if points.covariance_m2 is not None and np.isfinite(points.covariance_m2).all():
             noise: F64 = (points.covariance_m2 + points.covariance_m2.T) / 2
             if not _exceeds(noise, NOISE_FLOOR_M**2):

@@ -1,6 +1,4 @@
-"""Measure each solution's error, lost detail and rate of change at some pixels, on the solver's
-thread.
-"""
+"""Measure each solution's error, lost detail and rate of change, on the solver's thread."""
 
 from __future__ import annotations
 

@@ -58,9 +58,7 @@ class FramePolicy:
         solved: SolutionKey | None,
         flat: SolutionKey | None,
     ) -> Decision:
-        """Decide what to do next for a request, given the run's and the content's versions and existing
-        results.
-        """
+        """Decide what to do next for a request, given the run's and content's versions and results."""
         if request.flat_wanted and not self._flat_wanted:
             self.episode += 1
         self._flat_wanted = request.flat_wanted

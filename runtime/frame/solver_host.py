@@ -93,9 +93,7 @@ class SolverHost(ABC):
         return self._sent
 
     def restart(self, reason: str) -> None:  # noqa: B027 - a solver in this process cannot be ended
-        """Replace the solver, if it runs in its own process. A reason is `was ended because it took too
-        long`.
-        """
+        """Replace the solver, if it has a process. A reason is `was ended because it took too long`."""
 
     def status(self) -> list[dict[str, Any]]:
         """Return what the solver's process uses, for the status. Empty if it is this process."""

@@ -95,9 +95,7 @@ def _faster(predictor: Predictor, made: Callable[[], GlBackend]) -> Choice:
 
 
 def solution_ms(predictor: Predictor, stack: PanelStack, backend: SolverBackend, *, runs: int) -> float:
-    """Return the time taken by the fastest of `runs` solutions, in ms, after an untimed one that compiles
-    and allocates.
-    """
+    """Return the time of the fastest of `runs` solutions, in ms, after an untimed one."""
     solver = predictor.on_panels(stack)
     assert solver is not None
     solver.set_backend(backend)

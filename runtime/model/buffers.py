@@ -78,9 +78,7 @@ class LayerSlots:
         return users[index]
 
     def hand_over(self, layers: U8) -> tuple[int, tuple[int, ...]] | None:
-        """Hand layers, copied unless in a slot, over to the presenter; return their slot and shape, or None
-        if none is free.
-        """
+        """Hand layers over to the presenter; return their slot and shape, or None if none is free."""
         index, offset = divmod(layers.ctypes.data - self._begun, self._memory.shape[1])
         if offset or not 0 <= index < SLOTS:
             buffer = self.take(layers.shape)

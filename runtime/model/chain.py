@@ -45,9 +45,7 @@ Columns = NDArray[np.floating[Any]]
 
 @dataclass(frozen=True, slots=True)
 class ColumnLaw:
-    """Columns u as t = middle + (1 - exp(-bend·(u - middle)))/bend, the homographies' coordinate; t = u
-    if the bend is 0.
-    """
+    """Columns u as t = middle + (1 - exp(-bend·(u - middle)))/bend, for homographies; t = u without bend."""
 
     bend: float = 0.0  # per column
     middle: float = 0.0  # column where t = u
@@ -95,8 +93,7 @@ class ChainFrame:
         return np.asarray(inverse / inverse[2, 2], np.float64)
 
     def eye_sigma_px(self, stack: PanelStack, *, eye_sigma_m: float, cell_px: int) -> F32:
-        """Return the three lengths (3,) that the network needs as input, given the tracking error's standard
-        deviation.
+        """Return the three lengths (3,) that the network needs, given the tracking error's deviation.
 
         The first two are how far this error moves the outer panels' pictures, along and across the rows. The third is
         the centre panel's parallax relative to the raster's plane, along the rows. Lengths along the rows are in units
@@ -192,9 +189,7 @@ class _Window:
 
 @dataclass(frozen=True, slots=True)
 class _LineOfEyes:
-    """The point F at (y, z) = towards_f_m2 / nearer_m, possibly infinitely far, where the eyes' line meets the raster's
-    plane.
-    """
+    """The point F at (y, z) = towards_f_m2 / nearer_m, maybe infinitely far, of the eyes' line in the plane."""
 
     nearer_m: float  # half the difference in x between the eyes, right minus left; 0: F is treated as infinitely far
     towards_f_m2: F64  # (2,) (y, z) of F, times nearer_m
@@ -244,8 +239,7 @@ def _window_of(middle: F64, stack: PanelStack, *, plane_m: float) -> _Window:
 
 @lru_cache(maxsize=8)
 def chain_modes(cells: int) -> tuple[F32, F32, F32, F32]:
-    """Return V, Ũ (cells + 1, cells + 1), s (cells + 1,) and U^T (cells + 1, cells): the chain operators'
-    modes.
+    """Return V, Ũ (cells + 1, cells + 1), s (cells + 1,), U^T (cells + 1, cells): the chains' modes.
 
     The (cells, cells + 1) difference operator A, with rows [.. -2 2 ..], is U·diag(s)·V^T. The mean operator B, with
     rows [.. 1/2 1/2 ..], is U·diag(cos)·Ũ^T, where cos = sqrt(1 - s²/16). The modes are known in closed form: they are

@@ -91,9 +91,7 @@ class Contract(Section):
 
 
 def parse_contract(metadata: dict[str, str], *, source: str | Path) -> Contract:
-    """Return the contract in an ONNX file's metadata. Raises InputError if it is missing, invalid or of
-    another version.
-    """
+    """Return the contract in an ONNX file's metadata. Raises InputError if it is missing or invalid."""
     text = metadata.get(METADATA_KEY)
     if text is None:
         raise InputError(source, METADATA_KEY, "the model has no contract; export it with `phasestack export`")

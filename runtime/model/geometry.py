@@ -126,9 +126,7 @@ class Geometry:
         return self._sets([range(len(self.eyes_m))], np.zeros((1, 2)))
 
     def _sets(self, shown: Sequence[Sequence[int]], moved_m: F64) -> RaySets:
-        """Return ray sets, given, for each turn, its views and the head's distance (right, up) from the tracked
-        position.
-        """
+        """Return ray sets, given, for each turn, its views and the head's offset (right, up)."""
         right, up = stack_from_eye(self.eyes_m.mean(axis=0))[:3, 0], np.array([0.0, 0.0, 1.0])
         turns, homographies = len(shown), []
         centre = np.array([self.rays.width_px / 2, self.rays.height_px / turns / 2, 1.0])
@@ -157,9 +155,7 @@ class Geometry:
         return float(eye_sigma_m * max(shares) / pitch_m)
 
     def tapers(self) -> tuple[F32, F32]:
-        """Return the rays' weights by column and by row: 1 inside a window, falling to 0 at edges that are
-        not a panel's.
-        """
+        """Return the rays' weights by column and row: 1 inside a window, 0 at edges that are not a panel's."""
         box, kept, matrix = self.boxes[self.middle], self.kept, self.middle_from_rays.mean(axis=0)
         width_px, height_px = self.rays.width_px, self.rays.height_px
         u = np.stack([np.arange(width_px) + 0.5, np.full(width_px, height_px / 2), np.ones(width_px)])
@@ -274,8 +270,8 @@ def _span(low: float, high: float, size: int) -> tuple[int, int]:
 
 
 def taper(at_px: F64, first: int, last: int, size: int, over_px: float) -> F32:
-    """Return weights that rise linearly from 0 at two limits to 1 within `over_px`, except at panel edges
-    (0 and `size`).
+    """Return weights that rise linearly from 0 at two limits to 1 within `over_px`, but not at panel
+    edges.
     """
     weights = np.ones(len(at_px))
     if over_px > 0 and first > 0:

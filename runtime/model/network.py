@@ -31,9 +31,7 @@ class PictureProposal:
     any_raster = False  # the network can propose only whole panels of one size
 
     def __init__(self, session: ModelSession, stack: PanelStack, *, source: Path) -> None:
-        """Create the proposal. Raises InputError if the contract requires another panel, or the graph's ports do not
-        fit.
-        """
+        """Create the proposal. Raises InputError if the contract or the graph's ports do not fit."""
         contract = session.contract
         self.session, self._stack = session, stack
         for given, wanted, name in (

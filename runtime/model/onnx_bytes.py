@@ -60,9 +60,7 @@ def digest(data: bytes) -> str:
 
 
 def has_external_data(data: bytes) -> bool:
-    """Return True if a model stores a tensor in another file. Raises ValueError if it is malformed or
-    nested too deeply.
-    """
+    """Return True if a model stores a tensor in another file. Raises ValueError if it is malformed."""
     return _refers_to_a_file("model", memoryview(data), DEEPEST)
 
 

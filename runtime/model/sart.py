@@ -75,9 +75,7 @@ class SartPredictor(Predictor):
         return Prediction(layers, watch.stage_ms, job.savings, self.iterations)
 
     def _panel_from_middle(self, eye_m: F64, index: int) -> F64:
-        """Return the 3x3 homography from middle-panel to layer pixels along an eye's rays, integers at centres as in
-        OpenCV.
-        """
+        """Return the 3x3 homography from middle-panel to layer pixels along an eye's rays, as OpenCV counts."""
         rasters = [self.stack.panel(n) for n in range(self.stack.count)]
         return between_pixel_centres(panel_from_middle(self.stack, rasters, eye_m, index))
 

@@ -58,7 +58,6 @@ def midpoints(eyes_m: Eyes) -> F64:
 
 def common_movement_m(before_m: Eyes, after_m: Eyes) -> F64:
     """Return the (3,) movement that people share: along each axis the least, or 0 if they move apart.
-
     Layers that follow it are exact for the person who moves least. A person at rest keeps a picture at rest.
     """
     moved = midpoints(after_m) - midpoints(before_m)
@@ -68,8 +67,7 @@ def common_movement_m(before_m: Eyes, after_m: Eyes) -> F64:
 
 
 def align(stack: PanelStack, *, solved_for_m: Eyes, eyes_m: Eyes) -> Alignment:
-    """Align layers that were solved for other eye positions to the current eyes. Never raises an
-    exception.
+    """Align layers that were solved for other eyes to the current eyes. Never raises an exception.
 
     At the limits `NEAREST_M`, `MOST_SHIFT` and `MOST_SCALE`, the layers are aligned to the farthest allowed point on
     the straight line from the old eyes to the current eyes, so that the alignment stays continuous. If a coordinate is

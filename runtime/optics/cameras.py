@@ -93,9 +93,7 @@ def looking_at_origin(
 
 
 def _within(matrix: F64, half: F64, width: int, height: int) -> bool:
-    """Return True if a picture covers all directions (x, y, 1) with |x| <= half[0] and |y| <= half[1]. `matrix` maps
-    them to its pixels.
-    """
+    """Return True if `matrix` maps all directions (x, y, 1) with |x| <= half[0], |y| <= half[1] into a picture."""
     corners = np.array([(x * half[0], y * half[1], 1.0) for x in (-1, 1) for y in (-1, 1)]) @ matrix.T
     if not (corners[:, 2] > 0).all():
         return False

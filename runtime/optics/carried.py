@@ -108,9 +108,7 @@ def expected_psnrs_db(
 
 
 def standard_error_db(errors: F64) -> float:
-    """Return a PSNR's standard error in dB, from the scatter of errors (1 + groups,): over all rows, then
-    over each group.
-    """
+    """Return a PSNR's standard error in dB, from the errors (1 + groups,) of all rows and of groups."""
     groups = errors[1:]
     relative = float(np.std(groups, ddof=1)) / len(groups) ** 0.5 / max(float(errors[0]), 1e-12)
     return float(10 / math.log(10) * relative)

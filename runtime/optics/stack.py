@@ -54,9 +54,7 @@ class Plane:
 
 @dataclass(frozen=True, slots=True)
 class PlaneRaster:
-    """Pixel grid on the plane x = x_m in `stack`: the pixel (u, v) is at y = left_m + u·pitch_u_m, z =
-    top_m - v·pitch_v_m.
-    """
+    """Pixel grid on x = x_m in `stack`: (u, v) is at y = left_m + u·pitch_u_m, z = top_m - v·pitch_v_m."""
 
     x_m: float
     left_m: float  # y of the left edge (u = 0)

@@ -61,9 +61,7 @@ def _projected(
     eye: tuple[float, float, float],
     x_m: float,
 ) -> F64:
-    """Return the map that projects x = x_m onto the tilted plane along rays from `eye`, and back along those from
-    `seen_from`.
-    """
+    """Return the map of x = x_m onto the tilted plane along rays from `eye`, and back from `seen_from`."""
     offset_m, right, up = depth
     normal, far = np.array([1.0, -right, -up]), x_m + offset_m
     origin, place = np.array(seen_from), np.array(eye)

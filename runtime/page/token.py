@@ -17,9 +17,7 @@ MOST_BYTES = 4096  # maximum number of bytes read from the file
 
 
 def token_of(path: Path) -> str:
-    """Read the token from a file, or create it. Raises InputError if that fails, others can access it, or
-    it is invalid.
-    """
+    """Read the token from a file, or create it. Raises InputError if others can access it."""
     token, name = secrets.token_urlsafe(TOKEN_BYTES), ""
     try:
         if not os.path.lexists(path):

@@ -60,9 +60,7 @@ class Monitor:
         return self.width_px, self.height_px
 
     def selection(self, monitors: Sequence[Monitor]) -> dict[str, Any]:
-        """Return the setting in `[[output.panels]]` that selects this one of the monitors: its serial number
-        if unique, otherwise its connector.
-        """
+        """Return the setting in `[[output.panels]]` that selects this monitor: serial number or connector."""
         is_unique = [monitor.serial for monitor in monitors].count(self.serial) == 1
         return {"edid_serial": self.serial} if self.serial and is_unique else {"connector": self.connector}
 

@@ -49,8 +49,8 @@ class Axis(NamedTuple):
     offset_px: float
 
     def turned(self, line: Line, size_px: tuple[int, int]) -> Line:
-        """Turn a map from layer to picture pixels into one from monitor to turned picture's, `size_px` as
-        seen by the viewer.
+        """Turn a map from layer to picture pixels into one from monitor to turned picture's, of `size_px`
+        seen.
         """
         scale, shift = line
         edge = 0.0 if self.sign > 0 else float(size_px[self.layer_axis])
@@ -175,9 +175,7 @@ class ProcessorPainter:
         return parts
 
     def _filled_by(self, panel: int, shown: ShownPanel, solved: _Pictures | None) -> PixelRect:
-        """Return the part of a picture outside which it shows the rest code; `solved` is None if the flat picture
-        counts.
-        """
+        """Return the part of a picture outside which it shows the rest code; `solved` may be None."""
         if solved is None:
             return _whole(self._screens[panel])
         mounting, rise = self._mountings[panel], solved.rises[panel] if shown.relief else 0.0

@@ -1,6 +1,4 @@
-"""The part of a panel's picture that a solution fills; the rest code around it is neither drawn nor
-copied.
-"""
+"""The part of a picture that a solution fills; the rest code around it is neither drawn nor copied."""
 
 from __future__ import annotations
 

@@ -120,9 +120,7 @@ def whole_report(
 
 
 def _refuse_unsuitable(methods: Sequence[Method], cases: Sequence[StillPair], stacks: Sequence[PanelStack]) -> None:
-    """Load every method for every stack now. Raises InputError, which names the first case file, if one does not serve
-    it.
-    """
+    """Load every method for every stack now, or raise InputError, which names the first case file."""
     for stack in dict.fromkeys([*(pair.stack for pair in cases), *stacks]):
         for method in methods:
             try:

@@ -101,9 +101,7 @@ class Polling:
         self._untimely = ""  # description of the latest implausible capture time
 
     def run(self, *, serial: str = "", was_well: bool = False) -> None:
-        """Poll the sensor, only the device with this serial number if given. `was_well`: it has delivered
-        before.
-        """
+        """Poll the sensor with this serial number, if given. `was_well`: it has delivered before."""
         self._was_well, self._serial = was_well, serial
         wait_s = REOPEN_AFTER_S
         while self._attempt():

@@ -145,9 +145,7 @@ class RealSenseDriver(Sensor):
         )
 
     def _capture_ns(self, frame: Any) -> int:
-        """Return a depth picture's capture time on the run's clock, by the SDK's timestamp on the host's or device's
-        clock.
-        """
+        """Return a depth picture's capture time on the run's clock, by the SDK's timestamp."""
         now_ns, stamp_ns = self._clock.now_ns(), round(frame.get_timestamp() * NS_PER_MS)
         age_ns: int = time.time_ns() - stamp_ns
         on_host = frame.get_frame_timestamp_domain() != self._rs.timestamp_domain.hardware_clock

@@ -287,9 +287,7 @@ def calibration_message(intrinsics: Intrinsics, *, capture_ns: int) -> bytes:
 
 
 def intrinsics_from_message(data: bytes) -> Intrinsics:
-    """Decode `calibration_message`. Raises ValueError if it is malformed or a focal length is not
-    positive.
-    """
+    """Decode `calibration_message`. Raises ValueError if it is malformed."""
     camera = _read(Camera, data)
     k = camera.K
     if k[0] <= 0 or k[4] <= 0:

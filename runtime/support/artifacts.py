@@ -223,9 +223,7 @@ def _check_free(place: Path, *, within: Path) -> None:
 
 @contextmanager
 def held_back() -> Iterator[None]:
-    """Suppress anything that libraries write to stderr's file descriptor, unless other threads are
-    running.
-    """
+    """Suppress what libraries write to stderr's file descriptor, unless other threads are running."""
     if threading.active_count() > 1:
         yield
         return

@@ -48,9 +48,7 @@ class Channel:
         return self._socket.fileno()
 
     def send(self, message: Any, *, timeout_s: float = 0.0) -> bool:
-        """Send a message. Return False if the other process has too many unread for `timeout_s`. Raises
-        ChannelClosed if it has ended.
-        """
+        """Send a message. False if too many are unread for `timeout_s`. Raises ChannelClosed."""
         large: list[memoryview] = []
 
         def aside(buffer: pickle.PickleBuffer) -> bool:

@@ -27,9 +27,7 @@ ROWS = 32  # rows converted together, which fit into a processor's cache
 
 
 def stated_profile(coded: bytes) -> bytes:
-    """Return the ICC profile of an encoded picture's declared colours, or empty bytes for sRGB or unknown
-    ones. The picture's beginning is sufficient.
-    """
+    """Return the ICC profile of an encoded picture's (or its beginning's) declared colours, or b""."""
     found = NCLX.search(coded[:SEARCHED]) if coded[4:8] == b"ftyp" else None
     if found is None:
         return b""

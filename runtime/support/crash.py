@@ -23,9 +23,7 @@ KEPT = 20  # maximum number of reports; a service that fails repeatedly must not
 
 
 def written(error: BaseException) -> str:
-    """Write an exception report, and return a line for the user that names the file or its failure. Never
-    raises.
-    """
+    """Write an exception report, and return a line that names the file or its failure. Never raises."""
     summary = one_line(f"{type(error).__name__}: {error}" if str(error) else type(error).__name__)
     if place := _user_code(error):
         report = report_of("", "".join(traceback.format_exception(error))).removeprefix(REPORT)

@@ -19,9 +19,7 @@ JSON_BYTES_MAX = 65536
 
 
 def other_view(file: IO[bytes]) -> tuple[slice, bool] | None:
-    """Return the second JPEG's byte range in a Leia picture, and if it is the left eye's, or None for
-    others. The file's position changes.
-    """
+    """Return the second JPEG's byte range in a Leia picture, and if it is the left eye's, or None."""
     size = file.seek(0, 2)
     if size < 6:
         return None

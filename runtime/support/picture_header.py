@@ -355,9 +355,7 @@ def camera_set_in(folder: Path) -> str:
 
 
 def read_coded(path: Path) -> tuple[bytes, Header]:
-    """Read a picture file's bytes and its checked header. Raises InputError, also for a camera set's
-    folder.
-    """
+    """Read a picture file's bytes and its checked header. Raises InputError."""
     if untrusted_input.is_there(path, folder=True) and (problem := camera_set_in(path)):
         raise InputError(path, "", problem)
     data = untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)

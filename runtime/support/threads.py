@@ -32,9 +32,7 @@ def parallel_map(work: Callable[[Item], Result], items: Sequence[Item]) -> list[
 
 
 def on_rows(work: Callable[[int, int], None], rows: int, *, threads: int | None = None) -> None:
-    """Split rows into `threads` parts, by default OpenCV's, and call `work(begin, end)` for each in
-    parallel.
-    """
+    """Split rows into `threads` parts, by default OpenCV's, for `work(begin, end)` in parallel."""
     parts = threads or max(1, cv2.getNumThreads())
     parallel_map(lambda span: work(*span), list(pairwise(rows * part // parts for part in range(parts + 1))))
 

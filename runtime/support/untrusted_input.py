@@ -47,9 +47,7 @@ LIMITS = Limits()  # not configurable; tests lower them
 
 
 def checked_path(path: str | Path, *, source: str | Path = "", field: str = "") -> Path:
-    """Return a path, which need not exist. Raises InputError if it is too long, contains NUL or is not
-    UTF-8.
-    """
+    """Return a path, which need not exist. Raises InputError if it is too long or not UTF-8."""
     try:
         os.lstat(path)
     except ValueError:

@@ -128,9 +128,7 @@ def retarder_between_quarter_waves(angle_rad: ArrayLike, dispersion: float = 1.0
 
 
 def twisted_nematic(twist_rad: ArrayLike, beta_rad: ArrayLike) -> C128:
-    """Return the (..., 2, 2) matrices of cells with a uniform twist from x towards y, and a retardance
-    π·d·Δn/λ of `beta_rad`.
-    """
+    """Return (..., 2, 2) matrices of cells with this twist from x to y and retardance π·d·Δn/λ."""
     twist, beta = np.broadcast_arrays(np.asarray(twist_rad, np.float64), np.asarray(beta_rad, np.float64))
     gamma = np.sqrt(twist**2 + beta**2)
     sine = np.sinc(gamma / math.pi)  # sin(gamma)/gamma, 1 at 0

@@ -123,9 +123,7 @@ def _diffraction_table() -> tuple[F64, F64]:
 
 
 def diffraction_orders(random: F64) -> F64:
-    """Return angles in units of wavelength/width, distributed as behind a slit (sinc², Fraunhofer), from
-    uniform numbers.
-    """
+    """Return angles in wavelength/width, distributed as behind a slit (sinc²), from uniform numbers."""
     return np.asarray(np.interp(random, *_diffraction_table()))
 
 
@@ -255,16 +253,14 @@ class Lags:
         return self.timing.is_still
 
     def starts(self, row_share: F64) -> F64:
-        """Return when each panel updates rows (P,) at 0 (top) to 1, shape (N, P), relative to the middle row
-        without delay.
-        """
+        """Return when each panel updates rows (P,) at 0 (top) to 1, (N, P), relative to the middle row."""
         bottom_up = self.timing.bottom_up or (False,) * len(self.late)
         down = self.timing.scan * (row_share - 0.5)
         return np.stack([late + (-down if up else down) for late, up in zip(self.late, bottom_up, strict=True)])
 
     def of(self, index: int, row_share: F64) -> tuple[F64, F64]:
-        """Return a panel's weights of frames (frames, P), newest first, and the newest one's age (P,), at
-        rows from 0 (top) to 1.
+        """Return a panel's weights of frames (frames, P), newest first, and the newest one's age (P,), by
+        row.
         """
         starts = self.starts(row_share)
         start = starts[index] - starts.min(axis=0)

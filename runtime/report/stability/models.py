@@ -109,9 +109,7 @@ class StiffProblem:
         return weights, np.broadcast_to(self.target(side), u.shape)[inside]
 
     def residual(self, layers: F64) -> float:
-        """Return the RMS residual of panel values (3, HEIGHT_PX, WIDTH_PX), relative to the targets'
-        deviation from 1.5.
-        """
+        """Return the RMS residual of panel values (3, HEIGHT_PX, WIDTH_PX), relative to the targets'."""
         missing, whole = 0.0, 0.0
         for weights, target in map(self.rays, (0, 1)):
             sums = sum(
