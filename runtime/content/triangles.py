@@ -20,8 +20,6 @@ from runtime.records import F32, F64, U8
 from runtime.support.gl import DrawnPicture, set_uniforms
 
 PROJECTED_MAX = 5000  # if a part has more vertices, its box is projected instead to find its extent
-DRAWN_AT_ONCE = 20_000  # triangles per draw call
-UPLOADED_AT_ONCE = 8 << 20  # bytes per upload
 ATTRIBUTES = ("in_normal", "in_uv", "in_colour")
 
 ANY_ALPHA = 2.0  # limit that is larger than any alpha
@@ -168,16 +166,15 @@ class DrawnPart:
     def upload(self, context: Any, surface_program: Any, outline: Any, textures: list[Any]) -> None:
         """Create the part's GL objects; the source owns program, outlines' vertex array and textures."""
         self.surface_program, self.outline, self.textures = surface_program, outline, textures
-        self._buffer, self._triangles = (_uploaded(context, array) for array in (self.vertices, self.triangles))
+        self._buffer, self._triangles = (context.buffer(array) for array in (self.vertices, self.triangles))
         if self.edges is None and not self.is_projected:  # this may free hundreds of MiB
             self.vertices, self.triangles = self.vertices[:0].copy(), self.triangles[:0].copy()
         layout = _layout(surface_program, self._buffer, ("in_position", *ATTRIBUTES), (3, 3, 2, 4))
         self.surface = context.vertex_array(surface_program, [layout], index_buffer=self._triangles)
 
     def draw_surface(self) -> None:
-        """Draw the triangles, in several calls: a software rasteriser holds Python's lock in each."""
-        for first in range(0, self.corner_count, 3 * DRAWN_AT_ONCE):
-            self.surface.render(first=first, vertices=min(3 * DRAWN_AT_ONCE, self.corner_count - first))
+        """Draw the triangles."""
+        self.surface.render(vertices=self.corner_count)
 
     def release(self) -> None:
         """Release the GL objects that the part owns. Releasing a vertex array does not release its buffers."""
@@ -391,15 +388,6 @@ class TriangleSource(CanvasSource):
                 part.outline.render(first=len(TRIANGLES) * begin, vertices=len(TRIANGLES) * count)
                 begin += count
         framebuffer.depth_mask = True
-
-
-def _uploaded(context: Any, array: Any) -> Any:
-    """Upload an array to a new buffer, in pieces because each upload holds Python's lock."""
-    data = memoryview(array).cast("B")
-    buffer = context.buffer(reserve=data.nbytes)
-    for first in range(0, data.nbytes, UPLOADED_AT_ONCE):
-        buffer.write(data[first : first + UPLOADED_AT_ONCE], offset=first)
-    return buffer
 
 
 def _gl(matrix: F64) -> F32:

@@ -84,7 +84,7 @@ class Reconfiguration:
                     predictor.close()
             else:
                 self._take_over(cell, opener, predictor, context=context, backend=backend)
-        BackgroundJob("memory", give_back)  # returns the replaced parts' memory to the system
+        give_back()  # the replaced parts' memory
         return True
 
     def _make_ready(self) -> Ready:

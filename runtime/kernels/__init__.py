@@ -65,7 +65,7 @@ def panel_loops() -> Any:
     loops.draw_panels.argtypes, loops.draw_panels.restype = [_pointer, _int, _int], None
     if _int.in_dll(loops, "shown_bytes").value != ctypes.sizeof(ShownPanel):
         raise ImportError(f"{built} was built from another version: {_AGAIN}")
-    short = ctypes.PyDLL(built)  # keeps the GIL, because the presenter could wait for it longer than it takes
+    short = ctypes.PyDLL(built)  # keeps Python's lock, because waiting for it again may take longer
     loops.frame_picture = short.frame_picture
     loops.frame_picture.argtypes = [_pointer, _long, _long, _int, _int, _pointer, _int, _int, _pointer]
     loops.frame_picture.restype = None

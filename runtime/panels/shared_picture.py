@@ -82,9 +82,8 @@ def _libraries() -> tuple[ctypes.CDLL, ctypes.CDLL, ctypes.CDLL]:
 
 @functools.cache
 def _short_calls() -> tuple[ctypes.PyDLL, ctypes.PyDLL]:
-    """Return the libraries of functions that only write to the connection. They keep Python's global lock. Taking it
-    again could take milliseconds, because the solver's thread, which has a lower priority, may lose its processor while
-    it has the lock.
+    """Return the libraries of functions that only write to the connection. They keep Python's global lock, because
+    waiting for it again takes milliseconds if another thread, such as the black box's, is busy.
     """
     x11, extensions = ctypes.PyDLL("libX11.so.6"), ctypes.PyDLL("libXext.so.6")
     x11.XFlush.argtypes = [c_void_p]

@@ -33,7 +33,7 @@ class Sensor(ABC):
     """Base class for drivers of depth cameras, eye trackers and recordings.
 
     The constructor only stores settings. `open` acquires the device, and cleans up if this fails. A driver is used by
-    only one thread, which may be abandoned if an SDK hangs.
+    only one thread. Its process is killed if a call hangs.
 
     A custom driver is configured by `sensor.driver = "module:Class"` and constructed as `Class(options, clock=clock)`.
     `options` is an instance of the class's `Options`, validated from `[sensor.options]`. `clock` is the run's clock.

@@ -34,7 +34,7 @@ def ends_by(at_s: float) -> None:
 
 
 def patience_s(most_s: float) -> float:
-    """Return how long to wait for a thread that may be abandoned: `most_s`, but not past the deadline."""
+    """Return how long to wait for a thread to end: `most_s`, but not past the deadline."""
     return max(0.0, min(most_s, _ends_by_s - time.monotonic()))
 
 

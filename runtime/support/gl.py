@@ -7,7 +7,6 @@ import mmap
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from runtime.errors import MissingPart
@@ -60,20 +59,6 @@ def leave_context() -> None:
     egl.eglMakeCurrent(egl.eglGetCurrentDisplay(), None, None, None)
 
 
-@cache
-def _gl_finish() -> Any:
-    return ctypes.CDLL(EGL["libgl"]).glFinish
-
-
-def finish() -> None:
-    """Wait until this thread's OpenGL commands are complete, without holding Python's global lock.
-
-    Calls to moderngl hold the lock. If one of them read a picture that a software rasteriser was still drawing, all
-    other threads would be blocked for tens of milliseconds.
-    """
-    _gl_finish()()
-
-
 def set_uniforms(program: Any, values: Mapping[str, Any]) -> None:
     """Set uniforms by name, skipping any that the compiler has removed."""
     for name, value in values.items():
@@ -100,7 +85,6 @@ class DrawnPicture:
 
         Call this method on the context's thread.
         """
-        finish()
         self.target.read_into(self.held, components=4)
         return self.held
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import queue
 import threading
 from collections.abc import Callable
+from contextlib import ExitStack
 from typing import Any
 
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock
@@ -86,30 +87,33 @@ class ThreadSolver(SolverHost):
         self._wake.set()
 
     def _run(self) -> None:
-        try:
-            self.parts = parts = RunningSolver(self._setup)
-            costs = CostBook(parts.first_costs(time_ns=self._clock.now_ns()))
-            self._news = taken_in(self._news, parts.step(first_request(self._clock.now_ns())))
-        except BaseException as error:
-            self._error = error
-            self._ready.set()
-            return
-        self._costs = costs.costs()
-        self._ready.set()
-        while not self._closing.is_set():
-            self._wake.wait(WAKES_S)
-            self._wake.clear()
-            orders: list[Any] = []
-            while not self._orders.empty():
-                orders.append(self._orders.get())
-            for answer in parts.turn([order for order in orders if not callable(order)]):
-                self._answers.put(answer)
-            for work in orders:
-                if callable(work):
-                    work()
-            request, self._request = self._request, None
-            if request is not None:
-                self._busy_since_ns = self._clock.now_ns()
-                self._news = taken_in(self._news, parts.step(request))
-                self._busy_since_ns = 0
-        parts.close()
+        with ExitStack() as cleanup:
+            try:
+                self.parts = parts = RunningSolver(self._setup)
+                cleanup.callback(parts.close)
+                self._costs = CostBook(parts.first_costs(time_ns=self._clock.now_ns())).costs()
+                self._news = taken_in(self._news, parts.step(first_request(self._clock.now_ns())))
+            except BaseException as error:
+                self._error = error
+                return
+            finally:
+                self._ready.set()
+            while not self._closing.is_set():
+                self._turn(parts)
+
+    def _turn(self, parts: RunningSolver) -> None:
+        self._wake.wait(WAKES_S)
+        self._wake.clear()
+        orders: list[Any] = []
+        while not self._orders.empty():
+            orders.append(self._orders.get())
+        for answer in parts.turn([order for order in orders if not callable(order)]):
+            self._answers.put(answer)
+        for work in orders:
+            if callable(work):
+                work()
+        request, self._request = self._request, None
+        if request is not None:
+            self._busy_since_ns = self._clock.now_ns()
+            self._news = taken_in(self._news, parts.step(request))
+            self._busy_since_ns = 0

@@ -25,7 +25,7 @@ from runtime.model.job import Job
 from runtime.model.targets import outside_codes, rest_of, target_table
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, I16
-from runtime.support.gl import DrawnPicture, finish
+from runtime.support.gl import DrawnPicture
 
 MOST_SETS = 6  # maximum number of ray sets that a shader reads; every driver allows 16 images
 
@@ -171,7 +171,6 @@ class GlState:
                 place = {"first": (kept.u0 - box.u0, kept.v0 - box.v0), "grey": self._channels == 1}
                 inputs = {"last": self._panel("last", n)}
                 self._passes.draw("show", (image,), inputs, place, at=(kept.u0, kept.v0, kept.width_px, kept.height_px))
-        finish()
         for texture, layer in zip(layers, buffer.pixels, strict=True):
             self._passes.target((Image(texture, width, height),)).read_into(layer, components=4)
 
