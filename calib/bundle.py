@@ -212,11 +212,9 @@ def _solved(problem: _Problem, state: _State, used: NDArray[np.bool_], *, robust
 
 
 def _refuse_reverse(problem: _Problem, state: _State) -> None:
-    """Raise Undetermined if the order of the panels is the reverse of the configured order.
-
-    The order counts as reversed if the configured order fits only with a camera behind the stack, or if it does not fit
-    but the reverse order does. (A camera behind the stack would take the same pictures as one in front of a stack that
-    is mirrored front to rear.)
+    """Raise Undetermined if the order of the panels is the reverse of the configured order. This is so if the
+    configured order fits only with a camera behind the stack (which would see a stack mirrored front to rear), or if it
+    does not fit but the reverse order does.
     """
     depth_m = problem.camera_m(state)[:, 2]
     behind = any(np.median(depth_m[problem.photograph == number]) <= 0 for number in range(problem.photographs))

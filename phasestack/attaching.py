@@ -21,25 +21,19 @@ SMALLEST = 0.25  # smallest pictures, as a fraction of the requested width and h
 
 
 def attach(plotter: Any, *, address: str = "", comfort_deg: float = 1.0, name: str = "") -> Attachment:
-    """Show a PyVista plotter's or a VTK render window's scene on the display.
+    """Show the scene of a `pyvista.Plotter`, or a `vtkRenderWindow` with a renderer, on the display.
 
     The application keeps its window, camera and interaction. The display shows the scene for the viewer's eyes: its
     camera's focal point is at the display's centre, and the window's section fills the display. While the application
     waits for its user (`plotter.show()` or an interactor's `Start`), frames are drawn as they are requested. An
-    application without such a loop calls `serve` or `step`.
+    application without such a loop calls `serve` or `step`. The attachment's `close` ends it.
 
     Args:
-        plotter: `pyvista.Plotter`, or `vtkRenderWindow` with at least one renderer.
-        address: Address of the scene `program`, as shown by `phasestack status`. By default, it is looked for.
-        comfort_deg: Largest difference in vergence between the content and the display. A deeper scene is flattened.
-        name: The application's name in phasestack's log.
+       address: Address of the scene `program`, as shown by `phasestack status`. By default, it is looked for.
+       comfort_deg: Largest difference in vergence between the content and the display. A deeper scene is flattened.
+       name: The application's name in phasestack's log.
 
-    Returns:
-        The attachment, which is ended by its method `close`.
-
-    Raises:
-        ValueError: An argument is invalid. The message begins with the argument's name.
-        MissingPart: A package of the extra `vtk` is not installed.
+    Raises ValueError, which begins with the argument's name, and MissingPart without the extra `vtk`.
     """
     window = plotter if hasattr(plotter, "GetRenderers") else getattr(plotter, "render_window", None)
     if window is None or not hasattr(window, "GetRenderers"):

@@ -20,7 +20,6 @@ DETAIL = 40.0  # Sobel gradient along a row at which a pixel's disparity counts
 
 def disparities(left: U8, right: U8) -> tuple[float, float] | None:
     """Return the farthest and nearest disparity of two RGB views, as fractions of their width.
-
     Disparities are positive in front of the screen. None if the views have too little in common.
     """
     step = max(1, left.shape[1] // (4 * WIDTH_PX))  # averaging all pixels of a large picture would take long
@@ -55,12 +54,8 @@ def disparities(left: U8, right: U8) -> tuple[float, float] | None:
 
 
 def adjusted(far_m: float, near_m: float, most_m: float) -> tuple[float, float]:
-    """Return how far to move the right view to the right, in metres, and the scale of both.
-
-    Args:
-        far_m: Disparity on the screen of the farthest content; positive in front.
-        near_m: Disparity of the nearest content.
-        most_m: Largest disparity of either sign.
+    """Return how far to move the right view to the right, in metres, and the scale of both. Disparities
+    of the farthest and nearest content, positive in front, become at most `most_m` of either sign.
     """
     if near_m - far_m > 2 * most_m:
         scale = max(2 * most_m / (near_m - far_m), SMALLEST)

@@ -35,10 +35,8 @@ def is_splats(primitive: Table) -> bool:
 
 
 def read_splats(file: GltfFile, primitive: Table) -> Gaussians:
-    """Read a primitive's splats, in the mesh's frame.
-
-    Raises InputError if they are damaged or none is visible, and LookupError, TypeError or ValueError if the file is
-    malformed.
+    """Read a primitive's splats, in the mesh's frame. Raises InputError if damaged or invisible, and as
+    `GltfFile`.
     """
     own = primitive["extensions"][SPLATS]
     for name in SPZ:
@@ -83,9 +81,8 @@ def turned(gaussians: Gaussians, matrix: F64, origin: Origin) -> Gaussians:
 
 
 def turned_harmonics(harmonics: F32, linear: F64) -> F32:
-    """Return harmonics (n, k, 3) that have been turned by a linear map (3, 3).
-
-    Exact for rotations, reflections and uniform scales, because they map the harmonics of each degree to each other.
+    """Return harmonics (n, k, 3) that have been turned by a linear map (3, 3). Exact for rotations,
+    reflections and uniform scales, because they map the harmonics of each degree to each other.
     """
     count = harmonics.shape[1]
     if count == 1 or np.allclose(linear, linear[0, 0] * np.eye(3)):

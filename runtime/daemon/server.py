@@ -218,10 +218,8 @@ def _is_gone(writer: StreamWriter) -> bool:
 
 
 async def _outcome(command: Command, writer: StreamWriter) -> dict[str, Any] | None:
-    """Wait for a command's outcome, and return the answer.
-
-    Returns None and cancels the command if the loop does not start it in time or the client disconnects. Raises Refusal
-    if the server is stopped.
+    """Wait for a command's outcome. None, and the command is cancelled, if it is not started in time or the client
+    leaves. Raises Refusal if the server is stopped.
     """
     answer = asyncio.wrap_future(command.answer)
     until_s = time.monotonic() + LOOP_ANSWERS_WITHIN_S

@@ -27,15 +27,11 @@ log = logging.getLogger(__name__)
 
 
 class EyeFinder:
-    """Finder that locates people's eyes in camera pictures.
+    """Finder of people's eyes in pictures: `find` follows one viewer, `find_all` as many as
+    `most_people`.
 
-    `find` follows one viewer and ignores other people. `find_all` follows as many people as `most_people`.
-
-    Attributes:
-        choice: Description of how the viewer was chosen.
-        reason: Why no eyes of the viewer were found in the last frame, or an empty string.
-        pupils: The viewer's pupils found in the last frame, even if their distance is unknown. None if there were none.
-        found: None, because this finder has nothing for pages to show.
+    `choice` says how the viewer was chosen, `reason` why no eyes of the viewer were found in the last frame, or "".
+    `pupils` are those found there, even if their distance is unknown. `found` is None: pages show nothing.
     """
 
     found = None

@@ -100,12 +100,9 @@ class _Look:
 
 
 class PupilFinder:
-    """Finder that follows one viewer's pupils from picture to picture.
-
-    Attributes:
-        viewer: Viewer number, which increases with every new viewer.
-        reason: Why no pupils were found in the last picture, or an empty string.
-        choice: Description of how the viewer was chosen.
+    """Finder that follows one viewer's pupils from picture to picture. `viewer` is a number that
+    increases with every new viewer, `reason` says why no pupils were found in the last picture, or "", and `choice` how
+    the viewer was chosen.
     """
 
     def __init__(self, *, lock_ns: int = 0, shares: PupilFinder | None = None) -> None:

@@ -100,11 +100,8 @@ class RunObserver:
         return {"live_db": self._sampler.live_db, "view_error_mm": self._lines.view_error_mm.of("p50", "p95")}
 
     def light(self, refresh: Refresh | None) -> dict[str, Any]:
-        """Return the light measured for a refresh's eyes, content and model, for the daemon's status.
-
-        Returns:
-            `light_db`; `light_age_s`, the time since the measured refresh; `measured_frame`, that refresh's number. All
-            are None if the eyes, the content or the model have changed since, or a better solution has been found.
+        """Return the light measured for a refresh's eyes, content and model, for the status. `light_db`,
+        `light_age_s` and `measured_frame` are None if these have changed since, or a better solution was found.
         """
         moment = None if refresh is None else self._sampler.figure_of(refresh)
         if refresh is None or moment is None or moment.account is None:
