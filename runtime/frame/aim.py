@@ -72,16 +72,8 @@ class Aim:
         flat_wanted: bool,
         paused: bool,
     ) -> SolveRequest:
-        """Return the next solver request.
-
-        Args:
-            timing: Predicted times for the current refresh.
-            eyes: Eyes at the current refresh's display time.
-            shown: The latest solution.
-            composed_ns: When the current refresh was composed.
-            now_ns: When the request is posted.
-            flat_wanted: True if the flat picture is shown or will be needed soon.
-            paused: True if the operator has paused the picture.
+        """Return the next solver request, posted at `now_ns` for a refresh composed at `composed_ns`.
+        `flat_wanted`: the flat picture is shown or will be needed soon. `paused`: the operator has paused the picture.
         """
         self._learn(shown, eyes)
         begins_ns = min(max(self._solver.free_ns(now_ns), now_ns), now_ns + self._period_ns)  # else replaced by then
@@ -220,13 +212,8 @@ class Aim:
 
 
 def focused(shown: Solution, most: int, costs: Costs, *, horizon_s: float) -> Effort | None:
-    """Return the effort that gives a resting head's solution focus; None if not needed or too slow.
-
-    Args:
-        shown: The solution, which cannot be refined otherwise.
-        most: Number of steps for the new solution.
-        costs: Solution costs.
-        horizon_s: How long the head is expected to stay at rest, in seconds.
+    """Return the effort of at most `most` steps that gives a resting head's solution, otherwise final,
+    focus, or None.
     """
     if shown.effort is None or shown.effort.reduction > 1 or shown.effort.focus or most < 1:
         return None

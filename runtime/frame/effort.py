@@ -1,21 +1,10 @@
 """Choose the raster and number of steps so that each solution has the least expected error.
 
-A solution that takes c seconds to compute is shown for about c/P refreshes, where P is the refresh period, and is
-computed for the eye positions expected at the middle of their display times. These times deviate from the middle by s,
-the root mean square. Averaged over the refreshes, the squared error of the light at the true eyes is Q, the error for a
-still viewer, plus D, the error due to an outdated view (docs/mathematics.md, "Effort"):
-
-    J = Q(raster, steps) + D(sqrt(2·sigma² + v²·s² + l²), s),    s² = (max(c, P)² - P²)/12,
-    D(d, t) = y / (1 + y/D_max),    y = a·d²/(d + d0) + b·t²
-
-Here sigma is the tracking error along each axis at the middle time, v is the head's speed, and l is how far
-the head moves beyond the tracker's prediction horizon. All three are multiplied by one factor that makes the predicted
-displacements match the observed ones. The rates a and b describe how fast the picture changes as the head moves and as
-time passes, and D_max is half the picture's variance. All of a, b and D_max are measured on successive target pictures.
-
-Until a solution is complete, the panels show the previous one, with error E, and do not respond if the head starts
-moving. The mean error over a horizon H is (c·E + (H - c)·J) / H + D_max·(c/H)²/2. The effort with the lowest mean error
-is chosen, unless the current effort or a faster one is nearly as good.
+docs/mathematics.md, "Effort", has the equations: a solution of cost c, shown for the eyes expected at the middle of its
+display times, which spread by s, has the error J (E1, E2). Until it is complete, the panels show the previous one, with
+error E, and do not respond if the head starts moving (E3). The effort with the lowest mean error over the horizon is
+chosen, unless the current effort or a faster one is nearly as good. The rates a, b and D_max are measured on successive
+target pictures.
 """
 
 from __future__ import annotations
@@ -86,11 +75,8 @@ def stages_for(stage_ms: Mapping[str, float], *, people: float) -> dict[str, flo
 
 
 def simulated_costs(stage_ms: Mapping[str, float], reductions: Iterable[int]) -> Costs:
-    """Derive the costs on each raster by scaling those configured for the full raster by pixel count.
-
-    Args:
-        stage_ms: Time of each stage on the full raster, in milliseconds (`loop.simulated_stage_ms`).
-        reductions: Numbers by which the panels' rows and columns are divided, one for each raster.
+    """Scale the full raster's stage times in ms (`loop.simulated_stage_ms`) by pixel count, for each
+    reduction.
     """
     return Costs({by: {stage: stage_ms.get(stage, 0.0) / by**2 for stage in SOLVING_STAGES} for by in reductions})
 

@@ -151,12 +151,7 @@ def _grid_lines(picture: U8) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def _moved_grid(pictures: Sequence[U8], job: Job, eyes_m: Eyes) -> list[F32]:
-    """Sample a job's pictures on the coarse grid, as the panels would show them once the eyes have moved.
-
-    Args:
-        pictures: The job's pictures at half size, from `_halved`.
-        eyes_m: Eyes after the movement.
-    """
+    """Sample pictures at half size (`_halved`) on the coarse grid, as the panels would show them to the moved eyes."""
     stack = job.stack
     old_m = job.eyes_m.mean(axis=0)
     shared = len(eyes_m) > 2

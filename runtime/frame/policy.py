@@ -105,13 +105,7 @@ def _is_more(effort: Effort | None, done: Effort | None) -> bool:
 
 
 def wants_flat(eyes: EyesEstimate, *, flat_asked: bool, flatness: float) -> bool:
-    """Return True if the flat picture is being shown or may be needed soon.
-
-    Args:
-        eyes: Eyes at the display time.
-        flat_asked: True if the operator has asked for the flat picture.
-        flatness: The flat picture's current weight in the blend.
-    """
+    """Return True if the flat picture is shown, with weight `flatness`, or may be needed soon."""
     return flat_asked or flatness > 0.0 or eyes.label in ("held", "none")
 
 

@@ -279,10 +279,8 @@ class Presenter:
         return last[2]
 
     def _present(self, frame: PanelFrame, *, due_ns: int | None) -> tuple[PresentReport | None, str]:
-        """Present a frame at `due_ns` or, if that has passed or is None, at once.
-
-        Returns:
-            The report and "", or None and the reason if a panel is lost, or None and "" if there is no picture yet.
+        """Present a frame at `due_ns` or immediately; return the report and "", or None and the reason if a panel is
+        lost. Both are empty before the first picture.
         """
         if frame.solved is None and frame.flat is None:
             return None, ""

@@ -22,10 +22,8 @@ LINE = (
 
 
 class RefreshLines:
-    """Writes a line for each refresh to frames.jsonl and collects the view errors.
-
-    Lines are written in order. Each refresh is queued until the true eyes at its display time are known, or until it is
-    clear that they never will be.
+    """Writes a line for each refresh to frames.jsonl, in order, and collects the view errors. Each
+    refresh is queued until the true eyes at its display time are known, or never will be.
     """
 
     def __init__(self, truth: TrueEyes, write: Callable[[dict[str, Any]], None] | None) -> None:

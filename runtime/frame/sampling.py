@@ -176,9 +176,7 @@ class QualitySampler:
             self._resumes_s = now_s + (now_s - self._began_s) * (1 / share - 1)
 
     def finish(self, last: Refresh) -> None:
-        """Measure the run's last refresh. The result counts towards the means only if no other refresh has
-        been measured.
-        """
+        """Measure the last refresh, which counts towards the means only if no other one was measured."""
         drawn: list[RefreshTargets | None] = []
         account = self._truth.of(last.account)
         self._drawer.draw(self._wanted(last, account), None, drawn.append)

@@ -35,13 +35,7 @@ class Solver:
     """Computes at most one solution or flat picture in each step, with the state at its beginning."""
 
     def __init__(self, run: SceneCell, stack: PanelStack, *, timed: bool = True) -> None:
-        """Create a solver.
-
-        Args:
-            run: Cell that holds the solver's state.
-            timed: True to apply `model.budget_ms`. False on a simulated clock, because results must then not depend on
-                the machine's speed.
-        """
+        """Create a solver. On a simulated clock, `timed` is False, and `model.budget_ms` does not apply."""
         self.run, self.stack, self._timed = run, stack, timed
         self.measured = Measured()  # times and errors measured for each item of the plan
         self.plan: Plan | None = None
@@ -162,9 +156,7 @@ class Solver:
         return SolverUpdate(solution=solution)
 
     def _drawn(self, state: SceneState, request: SolveRequest, eyes_m: Eyes, reduction: int) -> Job:
-        """Draw a solution's target pictures. If the head is at rest, the pictures are also copied, because the solution
-        may be refined later.
-        """
+        """Draw a solution's target pictures, and copy them for a refinement if the head is at rest."""
         job = drawn_job(
             state.predictor,
             state.content,

@@ -26,7 +26,6 @@ IN_FRONT_M = 0.01  # eyes that are not at least this far in front of the front p
 
 class Viewer:
     """Estimates the eyes of the people who are served, in the `stack` frame, from a sensor's samples.
-
     Calibrates the samples, tracks the eyes, and detects which heads are at rest. Not thread-safe. Never reads a clock.
     """
 
@@ -93,11 +92,8 @@ class Viewer:
         return round((len(self._captures_ns) - 1) * NS_PER_S / (self._captures_ns[-1] - self._captures_ns[0]), 2)
 
     def take(self, frame: SensorFrame, *, serial: str) -> None:
-        """Process a sample. If the tracker refuses it, only count it.
-
-        Args:
-            frame: The sample.
-            serial: The sensor's serial number, or "" if it is unknown.
+        """Process a sample of the sensor with this serial number or "". If the tracker refuses it, only count
+        it.
         """
         self._captures_ns.append(frame.capture_ns)
         people = frame.people if self._in_stack_frame else [self._calibration.apply(points) for points in frame.people]
@@ -118,10 +114,8 @@ class Viewer:
         return together([self._served(person, person.tracker.ahead(time_ns)) for person in self._people.served])
 
     def _served(self, person: Person, eyes: EyesEstimate) -> EyesEstimate:
-        """Return a person's eyes, corrected in two ways.
-
-        If the head is at rest, its fixed eye positions are used instead. Eyes behind or too close to the front panel
-        are removed.
+        """Return a person's eyes, corrected in two ways. If the head is at rest, its fixed eye positions are used
+        instead. Eyes behind or too close to the front panel are removed.
         """
         rest, numbers = person.rest, (person.number,)
         if eyes.eyes_m is None:
@@ -135,9 +129,8 @@ class Viewer:
 
 
 def together(estimates: Sequence[EyesEstimate]) -> EyesEstimate:
-    """Combine the estimates for several people at the same instant into one.
-
-    The label is theirs if it is the same for all, and otherwise `predicted`.
+    """Combine the estimates for several people at the same instant into one. The label is theirs if it is
+    the same for all, and otherwise `predicted`.
     """
     known = [each for each in estimates if each.eyes_m is not None]
     if len(known) < 2:
