@@ -28,22 +28,12 @@ NO_LAYERS = np.empty((0, 0, 0, 4), np.uint8)
 
 
 def role(memory_bytes: int) -> Role:
-    """Return the solver's role.
-
-    Args:
-        memory_bytes: Limit for the solver's own memory.
-    """
+    """Return the solver's role, with a limit for its own memory."""
     return Role("solver", main, niceness=NICENESS, memory_bytes=memory_bytes, start_s=LIMITS.start_s)
 
 
 def main(parent: Parent, memory: int, setup: SolverSetup) -> None:
-    """Solve until the parent closes the channel.
-
-    Args:
-        parent: The presenter's process.
-        memory: File descriptor of the layers' shared memory.
-        setup: What to start with.
-    """
+    """Solve until the parent closes the channel. `memory` is the descriptor of the layers' shared memory."""
     keep_freed_memory()  # before any thread is started
     cv2.setNumThreads(setup.settings.model.threads or -1)
     slots = LayerSlots(memory, setup.stack)

@@ -13,17 +13,12 @@ SIGMAS = 3.0  # a radius of reach in standard deviations
 
 
 def assigned(distance_m: F64, radius_m: F64) -> tuple[list[int | None], list[bool]]:
-    """Assign heads to people, unless there is doubt.
+    """Assign heads to people, unless there is doubt, by distances and reaches (people, heads) from where
+    each is expected.
 
     As many people as possible get a head within their reach. Among these assignments, the likeliest is chosen. If
-    another one is nearly as likely, all people are in doubt to whom it assigns another head.
-
-    Args:
-        distance_m: (people, heads) distance of each head from where each person is expected.
-        radius_m: (people, heads) farthest that each person can have got from there, measurement errors included.
-
-    Returns:
-        For each person, the index of the head, or None; and for each person, True if there was doubt.
+    another one is nearly as likely, all people are in doubt to whom it assigns another head. Returns, for each person,
+    the index of the head or None, and True if there was doubt.
     """
     count = len(distance_m)
     found = [(sum(head is not None for head in heads), cost, heads) for cost, heads in _matchings(distance_m, radius_m)]

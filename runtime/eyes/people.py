@@ -48,10 +48,7 @@ class Person:
 
 
 class People:
-    """All people in front of the display, and those who are served.
-
-    Not thread-safe. Never reads a clock.
-    """
+    """All people in front of the display, and those who are served. Not thread-safe. Never reads a clock."""
 
     def __init__(
         self,
@@ -62,13 +59,7 @@ class People:
         join_s: float,
         in_front_m: float,
     ) -> None:
-        """Begin without any people.
-
-        Args:
-            most_served: Largest number of people served at the same time.
-            join_s: Time that a further person must stay in view before being served.
-            in_front_m: Eyes must have a larger x than this, in frame `stack`.
-        """
+        """Begin without people. A further person is served after `join_s` in view; eyes have x > `in_front_m`."""
         self._new_tracker, self._new_rest = new_tracker, new_rest
         self._most, self._join_ns, self._in_front_m = most_served, round(join_s * NS_PER_S), in_front_m
         self._count = 0  # highest number given to a person
@@ -95,15 +86,7 @@ class People:
             person.rest = self._new_rest()
 
     def update(self, seen: Sequence[EyePoints], *, capture_ns: int) -> list[str]:
-        """Add a sample.
-
-        Args:
-            seen: All people's eyes, nearest first, in frame `stack`.
-            capture_ns: The sample's capture time.
-
-        Returns:
-            For each of `seen`, why the eyes were refused, or an empty string.
-        """
+        """Add a sample of all people's eyes in `stack`, nearest first. Return why each was refused, or ""."""
         if max(len(self._people), len(seen)) > 1:
             self._several_ns = capture_ns
         elif abs(capture_ns - self._several_ns) > SEVERAL_NS:
@@ -167,9 +150,8 @@ class People:
     def _assigned(
         people: Sequence[Person], heads: Sequence[tuple[int, EyePoints]], capture_ns: int
     ) -> list[tuple[Person, int | None, bool]]:
-        """Return, for each person, the index of a head or None, and whether it is doubtful.
-
-        A doubtful head is returned for each person whose head it may be, once in all.
+        """Return, for each person, the index of a head or None, and whether it is doubtful. A doubtful head is returned
+        for each person whose head it may be, once in all.
         """
         distance_m, radius_m = np.full((2, len(people), len(heads)), np.inf)
         radius_m[:] = 0.0

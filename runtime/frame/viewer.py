@@ -32,13 +32,7 @@ class Viewer:
     def __init__(
         self, settings: Settings, calibration: Calibration, *, front_m: float, in_stack_frame: bool = False
     ) -> None:
-        """Create an estimator for people who have not been seen yet.
-
-        Args:
-            calibration: The sensor's calibration.
-            front_m: The front panel's x coordinate in the `stack` frame.
-            in_stack_frame: True if the sensor's measurements are already in the `stack` frame.
-        """
+        """Create an estimator for people in front of a front panel at x = `front_m`, not seen yet."""
         self._settings, self._calibration = settings, calibration
         self._nearest_m, self._in_stack_frame = front_m + IN_FRONT_M, in_stack_frame
         self._people = self._new_people()
