@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from runtime.config import ContentSettings
@@ -25,6 +26,9 @@ from runtime.errors import ContentFailure
 from runtime.records import F64, U8
 from runtime.support.background import begin
 
+POINTER = np.array([[0, 0], [0, 0.9], [0.22, 0.7], [0.36, 1], [0.5, 0.94], [0.36, 0.64], [0.64, 0.64]])  # an arrow
+POINTER_MIN_PX = 12  # smallest height of the mouse pointer
+POINTER_SIZE = 0.03  # height of the mouse pointer, as a fraction of the picture's
 FROZEN_S = 2.0  # a feed counts as frozen after this time without a picture
 CLOSES_WITHIN_S = 2.0
 MEASURED_EVERY = 3  # pictures after which the depth of a live picture is measured again
@@ -40,6 +44,7 @@ class LivePicture:
     rgb: U8  # (h, w, 3), with every view in the layout
     taken_s: float  # on the monotonic clock
     pixel_aspect: float = 1.0  # pixel width divided by pixel height
+    pointer: tuple[float, float] | None = None  # place of a mouse pointer to draw, as fractions of width and height
 
 
 class Feed(ABC):
@@ -67,10 +72,10 @@ class Feed(ABC):
     def _run(self) -> None:
         """Read pictures and call `_take` for each, until `_ends` is set."""
 
-    def _take(self, rgb: U8, pixel_aspect: float = 1.0) -> None:
+    def _take(self, rgb: U8, pixel_aspect: float = 1.0, pointer: tuple[float, float] | None = None) -> None:
         self._count += 1
         self._seen_s = time.monotonic()
-        self.newest = LivePicture(self._count, rgb, self._seen_s, pixel_aspect)
+        self.newest = LivePicture(self._count, rgb, self._seen_s, pixel_aspect, pointer)
         self.problem = ""
 
     def state(self) -> str:
@@ -144,6 +149,8 @@ class LiveSource(ContentSource):
             parts = layout.views(newest.rgb)
         except ValueError as error:
             raise ContentFailure(f"{self._feed.name}: {error}") from None
+        if newest.pointer is not None:
+            parts = with_pointer(parts, layout, newest.pointer)
         height, width = parts[0].shape[:2]
         aspect = layout.pixel_aspect(width_px=width, height_px=height)
         self._screen = screen(self._file.stack, width_px=width, height_px=height, pixel_aspect=aspect)
@@ -174,6 +181,29 @@ class LiveSource(ContentSource):
 
     def close(self) -> None:
         self._feed.close()
+
+
+def with_pointer(views: list[U8], layout: Layout, place: tuple[float, float]) -> list[U8]:
+    """Return copies of views with a mouse pointer at the screen's depth, that is at the same place in all of them.
+
+    Args:
+        views: Views of a picture, as returned by `layout.views`.
+        layout: Layout of the picture. Views of quilts and panoramas are returned unchanged.
+        place: Pointer's place in the whole picture, as fractions of its width and height.
+    """
+    if layout.kind == "quilt" or layout.span_deg:
+        return views
+    height, width = views[0].shape[:2]
+    at = np.array([place[0] * layout.columns % 1 * width, place[1] * layout.rows % 1 * height])
+    size = max(POINTER_SIZE * height, POINTER_MIN_PX) * np.array(
+        [1 / layout.pixel_aspect(width_px=width, height_px=height), 1]
+    )
+    corners = np.rint(16 * (at + size * POINTER)).astype(np.int32)  # in sixteenths of a pixel
+    drawn = [view.copy() for view in views]
+    for view in drawn:
+        cv2.fillPoly(view, [corners], (255, 255, 255), cv2.LINE_AA, 4)
+        cv2.polylines(view, [corners], isClosed=True, color=(0, 0, 0), thickness=1, lineType=cv2.LINE_AA, shift=4)
+    return drawn
 
 
 def layout_for(picture: LivePicture, settings: ContentSettings) -> Layout:

@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any
@@ -21,11 +21,13 @@ from runtime.config import Section, validated
 from runtime.content.base import ContentSource
 from runtime.content.live import Feed, LiveSource
 from runtime.content.placing import SceneFile
+from runtime.content.x_pointer import BUTTON, Pointed, XPointer
 from runtime.errors import InputError, one_line
 from runtime.records import U8
 
 LOOKS_EVERY_S = 0.5  # how often the window's place is looked up
 AGAIN_S = 0.5  # pause before the next attempt
+CLICK_S = 0.02  # how often the mouse button is looked at while the user chooses a window
 LOOKED_UP_WITHIN_S = 3.0  # time limit for the list of windows, and for a virtual screen's start
 OURS = "phasestack"  # class and title of our own panels
 WINDOW = re.compile(  # a line of `xwininfo -root -tree`
@@ -35,9 +37,10 @@ WINDOW = re.compile(  # a line of `xwininfo -root -tree`
 
 
 class WindowOptions(Section):
-    """Options in [content.options] for the scene `window`: one of `title`, `region` and `command`."""
+    """Options in [content.options] for the scene `window`: one of `title`, `pick`, `region` and `command`."""
 
     title: str = Field("", description="part of the window's title or class")
+    pick: bool = Field(False, description="show the window on which the user clicks next")
     region: tuple[int, int, int, int] | None = Field(None, description="part of the screen: left, top, width, height")
     command: tuple[str, ...] = Field((), description="program to start on a virtual screen, with its arguments")
     size_px: tuple[int, int] = Field((1920, 1080), description="size of the virtual screen")
@@ -47,8 +50,8 @@ class WindowOptions(Section):
 
     @model_validator(mode="after")
     def _one(self) -> WindowOptions:
-        if bool(self.title) + (self.region is not None) + bool(self.command) != 1:
-            raise ValueError("set one of title, region and command, such as { title = 'sView' }")
+        if bool(self.title) + self.pick + (self.region is not None) + bool(self.command) != 1:
+            raise ValueError("set one of title, pick, region and command, such as { title = 'sView' }")
         if self.region is not None and (min(self.region[:2]) < 0 or min(self.region[2:]) < 2):
             raise ValueError("region: must be left, top, width, height, with a size of at least 2 pixels")
         if not all(16 <= edge <= 16384 for edge in self.size_px):
@@ -70,7 +73,7 @@ class Place:
 def prepare(file: SceneFile) -> Callable[..., ContentSource]:
     """Return a function that creates the source. Raises InputError for wrong options or no X server."""
     options = validated(WindowOptions, file.settings.options, source="content.options")
-    needed = {"xwininfo": "x11-utils"} if options.title else {"Xvfb": "xvfb"} if options.command else {}
+    needed = {"xwininfo": "x11-utils"} if options.title or options.pick else {"Xvfb": "xvfb"} if options.command else {}
     for program, package in needed.items():
         if shutil.which(program) is None:
             raise InputError("content", "scene", f"window requires {program}; run: sudo apt-get install {package}")
@@ -83,9 +86,9 @@ def _source(options: WindowOptions, file: SceneFile, context: Any = None) -> Con
     return LiveSource(WindowFeed(options), file=file)
 
 
-def place_of(title: str, listed: str) -> Place | None:
-    """Return the place of the largest window, but our panels, whose title or class contains a text, in
-    any case, or None. `listed` is what `xwininfo -root -tree` prints.
+def place_of(title: str | int, listed: str) -> Place | None:
+    """Return the place of the window with a number, or of the largest one whose title or class contains a
+    text, in any case. None if there is none but our panels. `listed` is what `xwininfo -root -tree` prints.
     """
     found = []
     for line in listed.splitlines():
@@ -93,7 +96,8 @@ def place_of(title: str, listed: str) -> Place | None:
         if match is None:
             continue
         names = f"{match['name']} {match['kind']}".lower()
-        if title.lower() in names and f'"{OURS}' not in names:
+        is_meant = title.lower() in names if isinstance(title, str) else int(match["id"], 16) == title
+        if is_meant and f'"{OURS}' not in names:
             x, y = (int(match[axis].replace("+-", "-").lstrip("+")) for axis in "xy")
             found.append(Place(x, y, int(match["w"]), int(match["h"]), int(match["id"], 16)))
     return max(found, key=lambda place: place.width * place.height, default=None)
@@ -103,9 +107,14 @@ class WindowFeed(Feed):
     """Feed that captures a window. It begins again if the window is closed, moved or resized."""
 
     def __init__(self, options: WindowOptions) -> None:
-        name = options.command[0] if options.command else options.title or "the screen's region"
+        name = (
+            options.command[0]
+            if options.command
+            else options.title or ("the window" if options.pick else "the screen's region")
+        )
         super().__init__(name)
         self._options = options
+        self._picked = 0  # number of the window that the user chose, or 0
 
     def _run(self) -> None:
         while not self._ends.is_set():
@@ -125,20 +134,38 @@ class WindowFeed(Feed):
         options = self._options
         if options.region is not None:
             return Place(*options.region)
-        if not options.title:
+        if not options.title and not options.pick:
             return None
+        if options.pick and not self._picked:
+            self._picked = self._clicked(display)
         command = ["xwininfo", "-display", display, "-root", "-tree"]
         done = subprocess.run(command, capture_output=True, text=True, timeout=LOOKED_UP_WITHIN_S, errors="replace")
         if done.returncode:
             raise ValueError(f"the X server {display} cannot be used: {done.stderr.strip()}")
-        place = place_of(options.title, done.stdout)
+        place = place_of(self._picked or options.title, done.stdout)
         if place is None:
-            raise ValueError("no window has this title or class")
+            self._picked = 0
+            raise ValueError("no window has this title or class" if options.title else "the window cannot be shown")
         return place
+
+    def _clicked(self, display: str) -> int:
+        """Wait for a click, and return the number of the window there. Raises ValueError if there is none."""
+        self.problem = "click on the window to show"
+        was_down = True
+        with closing(XPointer(display)) as pointer:
+            while not self._ends.wait(CLICK_S):
+                now = pointer.now()
+                if now is None:
+                    raise ValueError(f"the X server {display} has ended")
+                is_down = bool(now.buttons & BUTTON)
+                if is_down and not was_down and now.child:
+                    return int(now.child)
+                was_down = is_down
+        raise ValueError("no window was chosen")
 
     def _capture(self, display: str, place: Place | None, process: subprocess.Popen[bytes] | None) -> None:
         """Take pictures until the scene, the program or the window's place ends."""
-        given = {"framerate": f"{self._options.rate_hz:g}", "draw_mouse": str(int(self._options.pointer))}
+        given = {"framerate": f"{self._options.rate_hz:g}", "draw_mouse": "0"}
         source = display
         if place is not None:
             given["video_size"] = f"{place.width}x{place.height}"
@@ -146,17 +173,18 @@ class WindowFeed(Feed):
                 given["window_id"] = str(place.window)
             else:
                 source = f"{display}+{place.x},{place.y}"
-        looked_s, last = time.monotonic(), np.empty((0, 0, 3), np.uint8)
-        with av.open(source, format="x11grab", options=given) as container:
+        looked_s, last, last_pointer = time.monotonic(), np.empty((0, 0, 3), np.uint8), None
+        with closing(XPointer(display)) as mouse, av.open(source, format="x11grab", options=given) as container:
             for frame in container.decode(video=0):
                 rgb: U8 = np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
                 self._seen_s = time.monotonic()
-                if self.problem or not np.array_equal(rgb, last):
-                    self._take(rgb)
-                    last = rgb
+                pointer = pointer_in(mouse.now(), place, rgb.shape[:2]) if self._options.pointer else None
+                if self.problem or pointer != last_pointer or not np.array_equal(rgb, last):
+                    self._take(rgb, pointer=pointer)
+                    last, last_pointer = rgb, pointer
                 if self._ends.is_set() or (process is not None and process.poll() is not None):
                     return
-                if self._options.title and self._seen_s - looked_s > LOOKS_EVERY_S:
+                if (self._options.title or self._picked) and self._seen_s - looked_s > LOOKS_EVERY_S:
                     looked_s = self._seen_s
                     if self._place(display) != place:
                         return
@@ -191,6 +219,15 @@ class WindowFeed(Feed):
             for one in (process, server):
                 if one is not None:
                     _ended(one)
+
+
+def pointer_in(now: Pointed | None, place: Place | None, size_px: tuple[int, ...]) -> tuple[float, float] | None:
+    """Return a pointer's place in a picture of a place, as fractions of its width and height, or None if outside."""
+    if now is None:
+        return None
+    left, top = (0, 0) if place is None else (place.x, place.y)
+    u, v = (now.x - left + 0.5) / size_px[1], (now.y - top + 0.5) / size_px[0]
+    return (u, v) if 0 <= u < 1 and 0 <= v < 1 else None
 
 
 def _ended(process: subprocess.Popen[bytes]) -> None:

@@ -24,6 +24,7 @@ from runtime.plan.drawing import raster_views
 from tests.waiting import eventually
 
 STACK = replace(StackGeometry().stack(), width_px=64, height_px=36)
+LARGE = replace(STACK, width_px=256, height_px=144)
 EYES = np.array([[0.6, -0.03, 0.0], [0.6, 0.03, 0.0]])
 SHOWS_HALVES = (  # a window whose left half has one colour and whose right half another
     "import sys, tkinter; root = tkinter.Tk(); root.title(sys.argv[1]); root.geometry(sys.argv[2])\n"
@@ -127,6 +128,67 @@ def test_an_x_server_that_ends_is_told(display: str) -> None:
     source.close()
 
 
+needs_a_mouse = pytest.mark.skipif(shutil.which("xdotool") is None, reason="needs xdotool")
+
+
+def mouse(display: str, *action: str) -> None:
+    subprocess.run(["xdotool", *action], env=os.environ | {"DISPLAY": display}, check=True)
+
+
+def pair_of(source: Any) -> list[np.ndarray]:
+    views = raster_views(EYES, LARGE.panel(1))
+    source.expect(views, time_ns=0)
+    return [source.render(view, time_ns=0)[..., :3].min(2).astype(int) for view in views]
+
+
+def tips(source: Any) -> list[list[float]]:
+    """Place of the arrow's tip in each view that shows it, as fractions of its width and height."""
+    try:
+        pictures = pair_of(source)
+    except ContentFailure:
+        return []
+    rows_columns = [np.argwhere(picture > 60)[0] for picture in pictures if (picture > 60).any()]
+    return [[column / LARGE.width_px, row / LARGE.height_px] for row, column in rows_columns]
+
+
+@needs_x
+@needs_a_mouse
+def test_the_mouse_pointer_is_at_the_screens_depth(display: str) -> None:
+    shown = window(display, "stereo", "320x90+20+30", "#000000", "#000000")
+    source = opened(title="stereo", display=display)
+    for x in (60, 220):  # the same place of the left and of the right half
+        mouse(display, "mousemove", "380", "280")  # outside the window
+        assert eventually(lambda: source.revision(time_ns=0) > 0 and tips(source) == [])
+        mouse(display, "mousemove", str(x), "75")
+        assert eventually(lambda: len(tips(source)) == 2)
+        np.testing.assert_allclose(tips(source), [[0.25, 0.5]] * 2, atol=0.08)
+    shown.kill()
+    shown.wait()
+    source.close()
+
+
+@needs_x
+@needs_a_mouse
+def test_a_window_is_picked_by_a_click(display: str) -> None:
+    both = (
+        window(display, "one", "120x90+0+0", "#ff0000", "#0000ff"),
+        window(display, "two", "120x90+200+0", "#00ff00", "#ffff00"),
+    )
+    source = opened(pick=True, pointer=False, display=display)
+    assert eventually(lambda: source.problem == "click on the window to show")
+
+    def is_picked() -> bool:
+        mouse(display, "mousemove", "260", "45", "mousedown", "1", "sleep", "0.1", "mouseup", "1")
+        return shows(source, (0, 255, 0), (255, 255, 0))
+
+    assert eventually(is_picked) and source.problem == ""
+    for one in both:
+        one.kill()
+        one.wait()
+    assert eventually(lambda: source.problem == "click on the window to show")
+    source.close()
+
+
 def test_the_largest_window_with_the_title_or_class_is_found() -> None:
     assert place_of("PLAYER", LISTED) == Place(20, -30, 640, 360, 0x200009)
     assert place_of("Tiny", LISTED) == Place(-1, -1, 1, 1, 0x600001)
@@ -152,8 +214,8 @@ def test_our_own_panels_are_never_found(display: str) -> None:
 @pytest.mark.parametrize(
     ("options", "why"),
     [
-        ({}, "set one of title, region and command"),
-        ({"title": "a", "region": (0, 0, 10, 10)}, "set one of title, region and command"),
+        ({}, "set one of title, pick, region and command"),
+        ({"title": "a", "region": (0, 0, 10, 10)}, "set one of title, pick, region and command"),
         ({"region": (0, 0, 0, 10)}, "region: must be left, top, width, height"),
     ],
 )
