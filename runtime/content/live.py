@@ -184,7 +184,7 @@ class LiveSource(ContentSource):
 
 
 def with_pointer(views: list[U8], layout: Layout, place: tuple[float, float]) -> list[U8]:
-    """Return copies of views with a mouse pointer at the screen's depth, that is at the same place in all of them.
+    """Return copies of views with a mouse pointer at the same place in all, which is the screen's depth.
 
     Args:
         views: Views of a picture, as returned by `layout.views`.

@@ -37,7 +37,7 @@ WINDOW = re.compile(  # a line of `xwininfo -root -tree`
 
 
 class WindowOptions(Section):
-    """Options in [content.options] for the scene `window`: one of `title`, `pick`, `region` and `command`."""
+    """Options for the scene `window`: one of `title`, `pick`, `region` and `command`."""
 
     title: str = Field("", description="part of the window's title or class")
     pick: bool = Field(False, description="show the window on which the user clicks next")
@@ -222,7 +222,7 @@ class WindowFeed(Feed):
 
 
 def pointer_in(now: Pointed | None, place: Place | None, size_px: tuple[int, ...]) -> tuple[float, float] | None:
-    """Return a pointer's place in a picture of a place, as fractions of its width and height, or None if outside."""
+    """Return a pointer's place as fractions of a picture's width and height, or None if it is outside."""
     if now is None:
         return None
     left, top = (0, 0) if place is None else (place.x, place.y)
