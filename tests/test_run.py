@@ -270,7 +270,7 @@ def test_the_demo_ends_in_time_and_says_so_with_one_figure(
         app(["demo", "--out", str(tmp_path)])
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["frames"] == 4 and summary["light_db"]
-    assert "time limit of 0 s ended the demo after 4 of 42 refreshes" in summary["stopped"]
+    assert "time limit of 0 s ended the demo after 4 of 42 refreshes; --frames 600" in summary["stopped"]
     told = capsys.readouterr().out
     assert "ended      the time limit of 0 s ended the demo after 4 of 42 refreshes" in told and "4 of 42" in told
     assert len(re.findall(r"[\d.]+ dB|_db ", told)) == 1, "one figure of quality"

@@ -44,7 +44,7 @@ def demo(
         def stop_reason(self) -> str:
             self._asked += 1
             is_over = self._asked >= LEAST and time.monotonic() > self._ends_s
-            more = f"--frames {FRAMES + 1} has no limit"
+            more = "--frames 600 plays the whole recording without a limit"
             shown = f"after {self._asked} of {frames} refreshes"
             return f"the time limit of {LONGEST_S:g} s ended the demo {shown}; {more}" if is_over else ""
 
