@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import tomllib
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from runtime.records import F64
 
@@ -55,6 +55,9 @@ def drawn_scene_from_stack(name: str) -> F64:
 
 def rotation_matrix(angles_deg: Triple, order: str) -> F64:
     """Return the 3x3 rotation about fixed (`xyz`) or moving axes (`XYZ`), as SciPy orders them."""
+    if not any(angles_deg):
+        return np.eye(3)
+    Rotation: Any = import_module("scipy.spatial.transform").Rotation  # takes a third of the time to import the solver
     angles = [angles_deg["xyz".index(letter)] for letter in order.lower()]
     return np.asarray(Rotation.from_euler(order, angles, degrees=True).as_matrix())
 
