@@ -111,10 +111,12 @@ def solved_eyes_of(account: RefreshAccount) -> tuple[F64, F64] | None:
 
     Both are (2P, 3), of the people it was computed for. The result is None without such people.
     """
-    first = (account.solved_for_m, account.eyes_m)
-    people = [(person.solved_for_m, person.eyes_m) for person in account.people] or [first]
-    solved = [solved_for_m for solved_for_m, eyes_m in people if solved_for_m is not None and eyes_m is not None]
-    used = [eyes_m for solved_for_m, eyes_m in people if solved_for_m is not None and eyes_m is not None]
+    solved: list[F64] = []
+    used: list[F64] = []
+    for person in account.people or (account,):
+        if person.solved_for_m is not None and person.eyes_m is not None:
+            solved.append(person.solved_for_m)
+            used.append(person.eyes_m)
     return (np.concatenate(solved), np.concatenate(used)) if solved else None
 
 

@@ -180,14 +180,15 @@ def _moving(page: GrowingPage, *, quick: bool) -> None:
 
 def _focal(page: GrowingPage) -> None:
     full = StackGeometry().stack()
+
+    def told(part: int, done: int, of: int) -> None:
+        page.doing(f"focal stack {part} of 2, {done}/{of}")
+
     with focal.cards_painter(full) as painter:
         pinhole, focused = (
-            focal.focal_stack(
-                painter, full, model="best", focus=focus,
-                progress=lambda done, of, part=part: page.doing(f"focal stack {part} of 2, {done}/{of}"),
-            )
+            focal.focal_stack(painter, full, model="best", focus=focus, progress=partial(told, part))
             for part, focus in ((1, False), (2, True))
-        )  # fmt: skip
+        )
     page.record["focal"] = {"model": pinhole.model, **_found(pinhole), "focus": _found(focused)}
     page.put("focal", focal_section(pinhole, focused))
 

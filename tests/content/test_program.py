@@ -99,7 +99,8 @@ class Program:
 
 
 def drawn(source: Any, time_ns: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    return retina_pictures(source, EYES, STACK, fov_deg=40, time_ns=time_ns)
+    left, right = retina_pictures(source, EYES, STACK, fov_deg=40, time_ns=time_ns)
+    return left, right
 
 
 def test_both_eyes_are_asked_for_at_once_and_get_their_own_picture(source: Any) -> None:

@@ -114,7 +114,7 @@ def test_a_sensor_that_lacks_descriptors_to_reopen_is_tried_again(number: int, o
     worker.start()
     try:
         if opened:
-            assert eventually(lambda: worker.state and worker.reason == "open it was", within_s=20)
+            assert eventually(lambda: worker.state is not None and worker.reason == "open it was", within_s=20)
         else:
             assert eventually(lambda: worker.state is SensorState.FAILED, within_s=20)
             assert isinstance(worker.error, InputError)
