@@ -132,7 +132,9 @@ needs_a_mouse = pytest.mark.skipif(shutil.which("xdotool") is None, reason="need
 
 
 def mouse(display: str, *action: str) -> None:
-    subprocess.run(["xdotool", *action], env=os.environ | {"DISPLAY": display}, check=True)
+    """Move or press the mouse. Xvfb refuses connections for a moment after its last client has left."""
+    environment = os.environ | {"DISPLAY": display}
+    assert eventually(lambda: subprocess.run(["xdotool", *action], env=environment).returncode == 0)
 
 
 def pair_of(source: Any) -> list[np.ndarray]:
@@ -156,6 +158,7 @@ def tips(source: Any) -> list[list[float]]:
 def test_the_mouse_pointer_is_at_the_screens_depth(display: str) -> None:
     shown = window(display, "stereo", "320x90+20+30", "#000000", "#000000")
     source = opened(title="stereo", display=display)
+    assert eventually(lambda: source.revision(time_ns=0) > 0)
     for x in (60, 220):  # the same place of the left and of the right half
         mouse(display, "mousemove", "380", "280")  # outside the window
         assert eventually(lambda: source.revision(time_ns=0) > 0 and tips(source) == [])
