@@ -72,9 +72,6 @@ effort for each solution. The table gives [live quality](contracts.md#error) in 
 mm (median and 95th percentile) and each effort's share of the time. Between solutions, the picture is
 [reprojected](mathematics.md#reprojection) according to its depth.
 """
-LEANING = """\
-The film shows every fourth refresh with `model.effort = "full"` ("before") and `"auto"` ("now"), and the true view.
-"""
 HEAD = """\
 <!-- Written by `make gallery`: change docs/make_gallery.py, not this page. -->
 
@@ -134,7 +131,6 @@ def page(report: dict[str, Any]) -> str:
             moving_text([Moving(**one) for one in report["moving"]]),
             "![live quality and view error by effort](images/moving-viewer.png)\n",
             "![a leaning head, before, now, and what it should see](images/leaning.webp)\n",
-            LEANING,
             "## Focal parallax\n",
             "Three cards are seen through a 4 mm pupil. For each card, the table gives its distance, and the "
             "distances of sharpest\nfocus for its picture through the layers and for the card itself.\n",
