@@ -28,9 +28,8 @@ Ready = tuple[Opener | None, Predictor | None]  # new content and model; None: u
 
 
 class Reconfiguration:
-    """A change of settings that takes effect as a whole once everything is loaded, or not at all.
-
-    The new content and model are loaded by a background job and then adopted by `advance` on the solver's thread.
+    """A change of settings that takes effect as a whole once everything is loaded, or not at all. The new
+    content and model are loaded by a background job and then adopted by `advance` on the solver's thread.
     """
 
     def __init__(
@@ -42,14 +41,7 @@ class Reconfiguration:
         reload_content: bool = False,
         slots: LayerSlots | None = None,
     ) -> None:
-        """Start loading.
-
-        Args:
-            settings: The new settings.
-            old: The current settings.
-            reload_content: True to reload the content even if its settings have not changed.
-            slots: Memory shared with the presenter's process.
-        """
+        """Start loading; `reload_content` even with equal settings. Layers go to `slots`, if given."""
         self.settings, self._old, self._stack = settings, old, stack
         self._reload_content, self._slots = reload_content, slots
         self.abandoned = False
@@ -62,15 +54,8 @@ class Reconfiguration:
         self.abandoned = True
 
     def advance(self, cell: SceneCell, context: Any, backend: SolverBackend) -> bool:
-        """Adopt the loaded parts. Called between steps until it returns True.
-
-        Args:
-            cell: The solver's state, to be replaced.
-            context: The solver's GL context.
-            backend: The solver's device.
-
-        Returns:
-            True once the change has been adopted, refused or discarded.
+        """Adopt the loaded parts between steps. Returns True once the change is adopted, refused or
+        discarded.
         """
         if not self._job.done:
             return False
@@ -121,10 +106,7 @@ class Reconfiguration:
         context: Any,
         backend: SolverBackend,
     ) -> None:
-        """Replace the solver's state and close any parts that were replaced.
-
-        If the new content or model fails, the old state is kept and `problem` is set.
-        """
+        """Replace the solver's state and close replaced parts, or keep it and set `problem` if the new ones fail."""
         now, moved = cell.state.settings.content, {}
         if now.scene == self.settings.content.scene:  # another scene is placed as configured
             moved = moved_since(self._old.content, now)
@@ -159,15 +141,8 @@ class Reconfiguration:
 def ready_predictor(
     settings: Settings, stack: PanelStack, *, slots: LayerSlots | None = None, warmed: bool = True
 ) -> Predictor:
-    """Load the configured model and warm it up.
-
-    Args:
-        slots: Memory shared with the presenter's process.
-        warmed: False to leave out the warming up, so that the first solutions take longer.
-
-    Raises:
-        InputError: The model cannot be used.
-        MissingPart: A package required by the model is not installed.
+    """Load the configured model and warm it up. Raises InputError if it cannot be used, or MissingPart.
+    Layers go to memory shared with the presenter, if given. Unless `warmed`, the first solutions take longer.
     """
     predictor = load_predictor(settings.model.name, stack, settings.model)
     if slots is not None:
@@ -182,10 +157,7 @@ def ready_predictor(
 
 
 def _tried(settings: Settings) -> None:
-    """Load an untrusted model and solve with it.
-
-    Runs in a child process, so that a crash cannot harm the daemon.
-    """
+    """Load an untrusted model and solve with it, in a child process that may crash."""
     ready_predictor(settings, settings.stack.stack()).close()
 
 

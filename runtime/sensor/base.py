@@ -49,28 +49,16 @@ class Sensor(ABC):
 
     @abstractmethod
     def open(self) -> None:
-        """Acquire the device.
-
-        Raises:
-            SensorLost: The device cannot be opened, but a retry may succeed.
-            FatalError: The device cannot be opened, and a retry would also fail.
-        """
+        """Acquire the device. Raises SensorLost if a retry may succeed, otherwise FatalError."""
 
     @abstractmethod
     def read_newest(self, timeout_s: float) -> SensorFrame:
-        """Return the newest unread frame, after waiting up to `timeout_s` for a new frame to arrive.
-
-        Raises:
-            SensorTimeout: No new frame arrived in time.
-            SensorLost: The device must be closed and reopened.
-            EndOfRecording: The recording has no more frames.
+        """Return the newest unread frame, after waiting up to `timeout_s` for a new one. Raises SensorTimeout
+        if none arrived, SensorLost if the device must be reopened, and EndOfRecording.
         """
 
     def read_arrived(self, timeout_s: float) -> list[SensorFrame]:
-        """Return all unread frames, oldest first, after waiting up to `timeout_s` for the first frame.
-
-        The default implementation returns only the newest frame. The exceptions are the same as for `read_newest`.
-        """
+        """Return all unread frames, oldest first, as `read_newest` does for one (the default)."""
         return [self.read_newest(timeout_s)]
 
     @abstractmethod
@@ -86,20 +74,13 @@ class Sensor(ABC):
 
 
 class SteppedSensor(Sensor):
-    """Driver that can also deliver samples without waiting, for runs on a simulated clock.
-
-    A subclass implements `open`, which passes an iterator of samples to `_begin`. `read_newest` and `read_arrived`
-    return the samples that have arrived according to the run's clock.
+    """Driver that can also deliver samples without waiting, for runs on a simulated clock. A subclass
+    implements `open`, which passes an iterator of samples to `_begin`. `read_newest` and `read_arrived` return the
+    samples that have arrived according to the run's clock.
     """
 
     def __init__(self, source: str, clock: Clock, *, latency_ms: float = 0.0) -> None:
-        """Store the settings.
-
-        Args:
-            source: Name to use for the source in messages.
-            clock: The run's clock. Capture times must be based on it.
-            latency_ms: Each sample's delay from capture to arrival.
-        """
+        """Store the source's name for messages, and each sample's delay from capture to arrival."""
         self._source, self._clock, self._latency_ns = source, clock, round(latency_ms * NS_PER_MS)
         self._frames: Iterator[SensorFrame] | None = None  # samples that follow `_next`; None if not open
         self._next: SensorFrame | None = None
@@ -111,19 +92,13 @@ class SteppedSensor(Sensor):
         self._frames = self._next = None
 
     def peek(self) -> SensorFrame | None:
-        """Return the sample that `next_sample` will return, or None if there are no more samples.
-
-        Raises SensorLost if the driver is not open.
-        """
+        """Return the sample that `next_sample` will return, or None. Raises SensorLost if not open."""
         if self._frames is None:
             raise SensorLost(f"{self._source}: the recording is not open")
         return self._next
 
     def next_sample(self) -> SensorFrame:
-        """Return the next sample without waiting.
-
-        Raises EndOfRecording after the last sample, and SensorLost if the driver is not open.
-        """
+        """Return the next sample without waiting. Raises EndOfRecording, or SensorLost if not open."""
         frame = self.peek()
         if frame is None or self._frames is None:
             raise EndOfRecording(f"{self._source}: the recording has ended")
@@ -151,13 +126,7 @@ class SteppedSensor(Sensor):
         return following is not None and self.available_ns(following) <= now_ns
 
     def _first_due(self, timeout_s: float) -> SensorFrame:
-        """Wait for the oldest unread sample and return it.
-
-        Raises:
-            SensorTimeout: The sample does not arrive in time.
-            EndOfRecording: The last sample has already been read.
-            SensorLost: The driver is not open.
-        """
+        """Wait for the oldest unread sample. Raises SensorTimeout, EndOfRecording, or SensorLost if not open."""
         following = self.peek()
         if following is None:
             return self.next_sample()  # raises EndOfRecording
@@ -170,10 +139,9 @@ class SteppedSensor(Sensor):
 
 
 class DeviceClock:
-    """Converts device timestamps to the host's clock, based on the fastest recent delivery.
-
-    The delay between a timestamp and the sample's arrival varies, but the minimum delay over a few seconds is nearly
-    constant. A new window is started every few seconds, to follow the drift between the two clocks.
+    """Converts device timestamps to the host's clock, based on the fastest recent delivery. The delay
+    between a timestamp and the sample's arrival varies, but the minimum delay over a few seconds is nearly constant. A
+    new window is started every few seconds, to follow the drift between the two clocks.
     """
 
     def __init__(self) -> None:
@@ -182,12 +150,7 @@ class DeviceClock:
         self._last_ns: int | None = None
 
     def host_ns(self, device_ns: int, *, arrival_ns: int) -> int:
-        """Convert a device timestamp to the host's clock. The result is not later than the arrival.
-
-        Args:
-            device_ns: Timestamp on the device's clock.
-            arrival_ns: The sample's arrival time on the host's clock.
-        """
+        """Convert a device timestamp to the host's clock, not later than its arrival there."""
         offset = arrival_ns - device_ns
         if self._last_ns is None or device_ns < self._last_ns:  # first sample or restarted device
             self._offsets, self._start_ns = [offset], arrival_ns

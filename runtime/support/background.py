@@ -57,10 +57,7 @@ def begin(name: str, run: Callable[..., None], *args: Any) -> threading.Thread:
 
 
 class BackgroundJob(Generic[T]):
-    """Job that runs a function on a background thread, starting on construction.
-
-    The attributes `done` and `problem` and the method `take` can be polled, because they never block.
-    """
+    """Job on a background thread, started on construction. `done`, `problem` and `take` never block."""
 
     def __init__(self, name: str, work: Callable[[], T], *, niceness: int = BACKGROUND_NICENESS) -> None:
         self._name, self._work, self._niceness = name, work, niceness
@@ -100,10 +97,9 @@ class BackgroundJob(Generic[T]):
 
 @contextmanager
 def before_all_others() -> Iterator[None]:
-    """Give the calling thread realtime priority within the block or, if not allowed, a low niceness.
-
-    At ordinary priority, the kernel lets a busy thread finish its time slice first, which would delay a refresh by up
-    to 3 ms. Threads and processes started within the block have ordinary priority.
+    """Give the calling thread realtime priority within the block or, if not allowed, a low niceness. At
+    ordinary priority, the kernel lets a busy thread finish its time slice first, which would delay a refresh by up to 3
+    ms. Threads and processes started within the block have ordinary priority.
     """
     policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
     before = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
@@ -119,13 +115,6 @@ def before_all_others() -> Iterator[None]:
 
 
 def set_niceness(niceness: int, thread: threading.Thread | None = None) -> None:
-    """Set the niceness of a thread and of any threads it starts later.
-
-    Has no effect if the system does not allow the change.
-
-    Args:
-        niceness: Niceness from -20 to 19. Lower values take precedence.
-        thread: Thread to change, by default the calling thread.
-    """
+    """Set the niceness, -20 (first) to 19, of this or another thread and those it starts, if allowed."""
     with suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, (thread or threading.current_thread()).native_id or 0, niceness)

@@ -38,21 +38,11 @@ T = TypeVar("T")
 def in_child(
     work: Callable[..., T], *args: Any, source: str | Path, seconds: float, memory_bytes: int | None = None
 ) -> T:
-    """Call `work(*args)` in a child process and return the result.
+    """Call `work(*args)`, both picklable, in a child process limited to `seconds` and `memory_bytes`.
 
-    If this thread's progress listener (`progress.listening`) raises an exception, the child is killed and the exception
-    propagates.
-
-    Args:
-        work: Function at the top level of a module.
-        args: Arguments for `work`. They must be picklable.
-        seconds: Time limit.
-        memory_bytes: Memory limit, by default `MEMORY_MAX`.
-
-    Raises:
-        PhasestackError: `work` raised this error.
-        InputError: `work` exceeded a limit, raised any other exception, or ended the process.
-        TransientError: No process can be started.
+    If this thread's progress listener raises an exception, the child is killed and it propagates. Raises `work`'s
+    PhasestackError, InputError if it exceeded a limit, raised another exception or ended the process, and
+    TransientError if no process can be started.
     """
     memory_bytes = memory_bytes or MEMORY_MAX
     # Put this copy of phasestack first.
@@ -159,9 +149,8 @@ def main(channel: Channel) -> None:
 
 
 def _passing(error: BaseException | None) -> OSError | None:
-    """Return the transient system error that caused a project error, for `is_retryable`, or None.
-
-    If the cause is a MemoryError, the process has reached its memory limit, so it ends.
+    """Return the transient system error that caused a project error, or None. If the cause is a MemoryError, the
+    process has reached its memory limit, so it ends.
     """
     while error is not None:
         if isinstance(error, MemoryError):

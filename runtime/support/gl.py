@@ -24,13 +24,8 @@ EGL: dict[str, Any] = {"backend": "egl", "libegl": "libEGL.so.1", "libgl": "libG
 
 
 def offscreen_context() -> moderngl.Context:
-    """Create an offscreen OpenGL context for content and offscreen panels, and make it current.
-
-    Use the context on one thread only.
-
-    Raises:
-        MissingPart: EGL does not provide OpenGL 3.3. The message names the Debian packages to install.
-        MemoryError: There is too little memory for the driver.
+    """Create an offscreen OpenGL context for one thread, and make it current. Raises MissingPart, which
+    names Debian packages, without OpenGL 3.3 by EGL, or MemoryError.
     """
     try:
         import moderngl
@@ -81,10 +76,7 @@ class DrawnPicture:
         return self.held.shape
 
     def pixels(self) -> U8:
-        """Read back the pixels, shape (h, w, 4). The array stays valid until the next picture is drawn.
-
-        Call this method on the context's thread.
-        """
+        """Read back the pixels (h, w, 4), on the context's thread, valid until the next picture is drawn."""
         self.target.read_into(self.held, components=4)
         return self.held
 
