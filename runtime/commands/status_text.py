@@ -13,7 +13,8 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
         "content", "content_problem", "content_left_out", "program", "playlist", "placing", "loading", "refused",
     ),
     "eyes": (
-        "eyes_m", "eyes_label", "eye_sigma_now_mm", "eye_sigma_mm", "sensor_hz", "stale_inputs", "rejected_samples",
+        "people", "people_in_view", "eyes_m", "eyes_label",
+        "eye_sigma_now_mm", "eye_sigma_mm", "sensor_hz", "stale_inputs", "rejected_samples",
     ),
     "solver": (
         "model_asked", "provider", "backend", "backend_why", "effort", "efforts", "solution", "inferences",
@@ -44,6 +45,8 @@ def status_lines(status: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _worded(name: str, value: Any) -> Any:
+    if name == "people":
+        return ", ".join(f"person {person['number']}" for person in value) + " served" if value else "none served"
     if name == "effort" and value:
         return effort_in_words(value)
     if name == "efforts" and value:

@@ -172,7 +172,7 @@ class TrackerSettings(Section):
     viewers: Literal[1, 2, "auto"] = Field(
         "auto",
         description="number of people served at the same time (auto: two from four panels on, otherwise one; two on "
-        "three panels cost each person 8 to 10 dB)",
+        "three panels cost each person 6 dB)",
     )
     join_s: Annotated[float, within(0.0, 60.0, "s")] = Field(
         1.0, description="time that a second person must stay in view before being served as well"

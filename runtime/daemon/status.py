@@ -65,7 +65,7 @@ def shown(presenter: Presenter, account: RefreshAccount, link: BrowserLink, run:
         "eyes_label": account.eyes_label,
         "eye_sigma_mm": account.eye_sigma_mm,
         "flatness": 1.0 if frame.solved is None else frame.flatness,
-        "solved_for_m": None if solution is None else solution.solved_for_m,
+        "solved_for_m": None if solution is None or solution.solved_for_m is None else solution.solved_for_m[:2],
         "scene": presenter.state.settings.content.scene,
         "model": presenter.state.settings.model.name,
         "page_ms": link.page_ms_of(account.capture_ns),
@@ -99,6 +99,8 @@ def snapshot(run: Run, account: RefreshAccount) -> dict[str, Any]:
             *presenter.samples.status(),
         ],
         "eyes_m": account.eyes_m,
+        "people": people_served(account),
+        "people_in_view": presenter.viewer.in_view,
         "eyes_label": account.eyes_label,
         "eye_sigma_now_mm": account.eye_sigma_mm,
         "solution": account.solution,
@@ -114,6 +116,20 @@ def snapshot(run: Run, account: RefreshAccount) -> dict[str, Any]:
         **stats.rates_now(),
         **stats.summary(stale_inputs=presenter.samples.stale_inputs),
     }
+
+
+def people_served(account: RefreshAccount) -> list[dict[str, Any]]:
+    """Return the number, the eyes and the estimated view error of each person who is served."""
+    return [
+        {
+            "number": person.number,
+            "eyes_m": person.eyes_m,
+            "view_error_estimated_mm": None
+            if person.solved_for_m is None
+            else round(view_error_mm(person.eyes_m, person.solved_for_m), 2),
+        }
+        for person in account.people
+    ]
 
 
 def _view_error_now_mm(account: RefreshAccount) -> float | None:

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from runtime.clock import NS_PER_S
-from runtime.config import Settings
+from runtime.config import TWO_VIEWERS_PANELS, Settings
 from runtime.eyes.calibration import Calibration
 from runtime.eyes.people import People, Person
 from runtime.eyes.plausibility import RefusalWatch
@@ -50,6 +50,8 @@ class Viewer:
 
     def _new_people(self) -> People:
         settings = self._settings
+        if settings.most_viewers > 1 and (count := len(settings.stack.x_m)) < TWO_VIEWERS_PANELS:
+            log.warning("tracker.viewers: while %d panels serve two people, each sees about 6 dB less", count)
         return People(
             self._new_tracker,
             lambda: _rest_watch(self._settings),

@@ -102,14 +102,14 @@ class _Page:
         views = moment.eye_views
 
         def packed() -> bytes:
-            pictures = [*moment.layers, *(as_codes(intensities(picture)) for picture in views.wanted)]
+            pictures = [*moment.layers, *(as_codes(intensities(picture)) for picture in views.wanted[:2])]
             return b"".join(cv2.cvtColor(p[..., :3], cv2.COLOR_RGB2RGBA).tobytes() for p in pictures)
 
         self._moment, self._under_way = moment, True
         data = await asyncio.to_thread(packed)
         height, width = views.wanted[0].shape[:2]
         size = [moment.layers.shape[2], moment.layers.shape[1]]
-        message = {"layers": "solved", "solved_for_m": views.eyes_m, "size": size, "target": [width, height]}
+        message = {"layers": "solved", "solved_for_m": views.eyes_m[:2], "size": size, "target": [width, height]}
         await self._say(message | {"frame": moment.account.frame})
         await self._socket.send_bytes(data)
 

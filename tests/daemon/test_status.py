@@ -9,6 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from runtime.commands.status_text import status_lines
 from runtime.daemon.status import snapshot
 from runtime.support.artifacts import to_json
 from runtime.support.figures import lines_of
@@ -56,3 +57,11 @@ def test_nothing_that_came_through_the_socket_breaks_a_line() -> None:
     lines = list(lines_of({"state": "tracking\nup 3 h", "scene": "\x1b[2Ja\u202eb", "refused": "x" * 10000}))
     assert all(line.isprintable() for line in lines)
     assert all(len(line) <= 2000 for line in lines)
+
+
+def test_people_are_listed_by_number(rig: Rig) -> None:
+    rig.refresh_until("tracking")
+    answer, _ = told_by(rig)
+    assert [person["number"] for person in answer["people"]] == [1] and answer["people_in_view"] == 1
+    assert answer["people"][0]["eyes_m"] == answer["eyes_m"]
+    assert any("person 1 served" in line for line in status_lines(answer))
