@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -48,7 +49,7 @@ DEEDS = {
 
 
 class Harmful(Sensor):
-    """Two eyes that sway, a hundred times a second. It does the deed in its file once, and removes the file."""
+    """Two eyes that sway, a hundred times a second. It does the deed in its file once."""
 
     name = "harmful"
     capabilities = Capabilities(eye_points=True, in_stack_frame=True)
@@ -69,9 +70,12 @@ class Harmful(Sensor):
         return SensorFrame(self._count, self._clock.now_ns(), EyePoints(eyes_m, np.ones(2)))
 
     def _do_deed(self, now: bool) -> None:
-        if now and self._file.exists():
-            deed = self._file.read_text()
-            self._file.unlink()
+        deed = ""
+        with suppress(FileNotFoundError):
+            deed = self._file.read_text() if now else ""
+        if deed in DEEDS:  # it may be only half-written
+            if deed != "exit":  # which the process outlives
+                self._file.unlink()
             DEEDS[deed]()
 
     def close(self) -> None:

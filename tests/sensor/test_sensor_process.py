@@ -7,6 +7,7 @@ import signal
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from runtime.config import SensorSettings
 from runtime.errors import FatalError, InputError
 from runtime.records import SensorFrame
 from runtime.sensor.live import SensorProcess, SensorSetup
-from runtime.sensor.polling import PICTURES_MAX, SensorState
+from runtime.sensor.polling import PICTURES_MAX
 from runtime.sensor.registry import open_sensor
 from tests.sensor.harmful import PICTURE_PX, Large
 from tests.waiting import eventually
@@ -67,8 +68,7 @@ def process(sensor: SensorProcess) -> psutil.Process:
 def until_running(sensor: SensorProcess) -> SensorFrame:
     """The first sample that arrives."""
     frames: list[SensorFrame] = []
-    assert eventually(lambda: bool(frames.__iadd__(sensor.take())))
-    assert sensor.state is SensorState.RUNNING and sensor.fault() == ""
+    assert eventually(lambda: bool(frames.__iadd__(sensor.take())) and sensor.fault() == "")
     return frames[0]
 
 
@@ -80,6 +80,7 @@ def test_whatever_a_driver_does_its_reason_is_told_and_samples_return(
     serial, before = sensor.serial, process(sensor)
     deed.write_text(what)
     assert eventually(lambda: sensor.take() == [] and REASONS[what] in sensor.fault()), sensor.fault()
+    deed.unlink(missing_ok=True)
     assert until_running(sensor).sequence < 100
     assert sensor.serial == serial  # the same device is opened again
     assert before.is_running() == (what == "exit")
@@ -102,7 +103,8 @@ def test_a_process_stopped_from_outside_is_replaced_without_leaks(sensor: Sensor
 
 def test_samples_skipped_by_a_process_that_has_ended_still_count(sensor: SensorProcess) -> None:
     until_running(sensor)
-    assert eventually(lambda: len(sensor.arrived(0)) > 1 or sensor.stale_inputs > 0)
+    assert eventually(lambda: bool(sensor.state) and len(sensor._frames) > 3)
+    sensor.arrived(0)
     before = sensor.stale_inputs
     process(sensor).kill()
     until_running(sensor)
@@ -152,11 +154,11 @@ def test_pictures_are_passed_whole_and_unread_ones_do_not_pile_up(tmp_path: Path
         sensor.start()
         assert eventually(lambda: int(count.read_text() or 0) > 5 * PICTURES_MAX)
         frames = sensor.take()
-        assert len(frames) <= 2 * PICTURES_MAX
+        assert 0 < len(frames) <= 4 * PICTURES_MAX
         for frame in frames:
             assert frame.colour is not None and frame.colour.shape == (*PICTURE_PX, 3)
             assert (frame.colour == frame.sequence % 256).all()
-        assert all(frame.sequence == number for number, frame in enumerate(frames[:PICTURES_MAX], start=1))
+        assert all(before.sequence < frame.sequence for before, frame in pairwise(frames))
         assert eventually(lambda: sensor.take() != [] and sensor.stale_inputs > 0)
     finally:
         sensor.close()
