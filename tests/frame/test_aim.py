@@ -35,7 +35,7 @@ def test_the_middle_is_that_of_the_refreshes_between_two_solutions(cost_ns: int,
         (Effort(1, 6), 2.0, 8, True),
         (Effort(2, 6), 2.0, 8, False),  # a finer raster comes first
         (Effort(1, 8, focus=True), 2.0, 8, False),
-        (Effort(1, 6), 20.0, 8, False),  # 8 steps of 60 ms are more than a quarter of two seconds
+        (Effort(1, 6), 25.0, 8, False),  # 8 steps of 75 ms are more than a quarter of two seconds
         (Effort(1, 6), 2.0, 0, False),  # a model without steps
     ],
 )
