@@ -382,3 +382,21 @@ def test_panels_as_built_show_what_the_simulator_computes(tmp_path: Path) -> Non
     real = phasestack.RealPanels(cells=(phasestack.Cell(white_deg=85.0),))
     simulated_db = phasestack.evaluate(layers, *targets, **at, panels=real, sigmas_mm=(0,)).light_db["0"]
     assert float(re.findall(r"(\d+\.\d) dB", told["told"])[0]) == pytest.approx(simulated_db, abs=0.5)
+
+
+@pytest.mark.slow
+def test_a_pupil_focused_on_a_panel_sees_that_panel_s_pixels_best(tmp_path: Path) -> None:
+    """Noise on the rear panel is right of the middle, noise on the front panel left of it."""
+    noise = np.random.default_rng(6).integers(0, 120, (360, 320, 1), np.uint8).repeat(3, 2)
+    layers = np.full((3, 360, 640, 3), 60, np.uint8)
+    layers[0, :, 320:] += noise
+    layers[2, :, :320] += noise
+    stack = PanelStack(640 * 0.27e-3, 360 * 0.27e-3, (-0.06, 0.0, 0.06), 640, 360)
+    page = viewer_html(layers, (), stack, eyes_m=eyes_at(distance_m=0.4), fov_deg=22, text=["focus"])
+    (tmp_path / "viewer.html").write_text(page)
+    told = driven("focus.mjs", tmp_path / "viewer.html", 640, 360, json.dumps([-60, 0, 60]), tmp_path)
+    assert told["errors"] == [] and told["slider"] == ["-40", True]
+    rear, middle, front = (cv2.imread(str(tmp_path / f"focus-{k}.png")).astype(float) for k in range(3))
+    right, left = (slice(100, 260), slice(440, 540)), (slice(100, 260), slice(100, 200))
+    assert rear[right].std() > 1.2 * middle[right].std() > 1.2 * front[right].std()
+    assert front[left].std() > 1.2 * middle[left].std() > 1.2 * rear[left].std()

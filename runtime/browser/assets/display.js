@@ -18,7 +18,7 @@ export const apply = (m, x, y) => {
 };
 export const middle = (eyes) => eyes[0].map((v, k) => (v + eyes[1][k]) / 2);
 export const moved = (eyes, by) => eyes.map((eye) => eye.map((v, k) => v + by[k]));
-const centre = (stack) => stack.x_m[stack.x_m.length >> 1];
+export const centre = (stack) => stack.x_m[stack.x_m.length >> 1];
 const dot = (a, b) => a.reduce((sum, v, k) => sum + v * b[k], 0);
 
 function reference(stack) {
@@ -468,15 +468,16 @@ export class Display {
   // part: [x, y, width, height]; y is measured from the bottom.
   // quick: what to sample the solution directly by (`panelDraws`), or null to trace the panels drawn by `show`.
   // rays: number of rays per pixel in each direction, or 0 for the exact picture.
+  // focus_m: x of the plane that a pupil with a width focuses on.
   // gain: 0 draws the picture, 1 draws the target, and larger values draw the difference from the target, multiplied by
   // `gain`.
-  see({ eye, nominal = eye, picture, part, quick = null, rays = 0, pupil_mm = 0, side = 0, gain = 0, stride = [1, 1], room = [0.07, 0.08, 0.1] }) {
+  see({ eye, nominal = eye, picture, part, quick = null, rays = 0, pupil_mm = 0, focus_m = centre(this.stack), side = 0, gain = 0, stride = [1, 1], room = [0.07, 0.08, 0.1] }) {
     if (this.isBuilt) rays = Math.max(rays, BUILT_RAYS);
     const g = this.g, { stack } = this, places = quick ? this.#use("quick", "solved") : this.#use(rays ? "grid" : "boxes", "shown");
     g.viewport(...part);
     const columns = [], apart = [];
     for (let n = 0; n < stack.x_m.length; n += 1) {
-      const m = panelFromPicture(stack, n, eye, picture, nominal), share = 1 - (stack.x_m[n] - eye[0]) / (centre(stack) - eye[0]);
+      const m = panelFromPicture(stack, n, eye, picture, nominal), share = 1 - (stack.x_m[n] - eye[0]) / (focus_m - eye[0]);
       const scale = 1 / (m[6] * picture.width / 2 + m[7] * picture.height / 2 + m[8] || 1); // positive in front of the eye
       for (let k = 0; k < 3; k += 1) columns.push(...[m[k], m[3 + k], m[6 + k]].map((v) => v * scale));
       apart.push((share * stack.width_px) / stack.width_m, (-share * stack.height_px) / stack.height_m);

@@ -1,6 +1,6 @@
 // User interface for a page that shows a display: the head is moved with the pointer or keys, and there are viewing
 // modes and figures.
-import { Display, IDEAL, alignment, unaligned, panelDraws, drawPlan, middle, moved, reach } from "/display.js";
+import { Display, IDEAL, alignment, unaligned, panelDraws, drawPlan, middle, moved, reach, centre } from "/display.js";
 
 const MODES = [ // key, name, group, hint
   ["wiggle", "Wiggle", "Eyes", "Alternates between the two eyes' pictures. The nearest parts jump the most."],
@@ -36,7 +36,8 @@ const PAGE = `
 <svg class="over" aria-hidden="true"></svg><div class="names" aria-hidden="true"></div><p class="notice" role="status" hidden></p></div>
 <aside><h1></h1><p class="how">Move your head with the pointer, a finger or the arrow keys. Scroll to move it nearer or farther.</p><div class="first"></div><div class="modes"></div><p class="hint"></p>
 <div class="switches"><label><input type="checkbox" data-key="aligned" checked> outer panels follow the head</label>
-<label><input type="checkbox" data-key="pupil"> pupils 4 mm wide</label><button type="button" class="quiet">Reset head</button></div>
+<label><input type="checkbox" data-key="pupil"> pupils 4 mm wide</label>
+<label class="slider"><span>focus, mm in front of the centre panel</span><input type="range" data-focus min="-150" max="150" step="5" value="0"><output>0</output></label><button type="button" class="quiet">Reset head</button></div>
 <details class="built"><summary>As built</summary><p class="how">What imperfect panels would show. See phasestack tolerance for what each costs.</p></details>
 <p class="head" role="status"></p><p class="light"></p><div class="point"></div>
 <div class="views"><figure><svg data-axis="1" viewBox="0 0 320 170" role="img" aria-label="Eyes and panels from above"></svg><figcaption>from above</figcaption></figure>
@@ -56,7 +57,7 @@ export class Look {
     Object.assign(this, { scene, stack: scene.stack, eyesAt, onTheWay });
     this.canvas = this.$("canvas");
     this.display = new Display(this.canvas, this.stack);
-    Object.assign(this, { mode: "parallel", head: [0, 0, 0], aligned: true, pupil: false, point: [0, 0], rays: 3, coarse: 1, frame_ms: 0, painted_ms: 0, reported_ms: 0, frames: 0 });
+    Object.assign(this, { mode: "parallel", head: [0, 0, 0], aligned: true, pupil: false, focus_mm: 0, point: [0, 0], rays: 3, coarse: 1, frame_ms: 0, painted_ms: 0, reported_ms: 0, frames: 0 });
     if (this.display.software) Object.assign(this, SOFTWARE);
     this.flatness = 0;
     this.used = null; // eyes that the panels are aligned to; null: the true eyes
@@ -95,6 +96,15 @@ export class Look {
   moveTo(head) {
     this.head = head;
     this.onhead();
+    this.draw();
+  }
+
+  // Focus the pupils, which get their width, on a plane `mm` in front of the centre panel.
+  focus(mm) {
+    const slider = this.$("[data-focus]");
+    slider.value = this.focus_mm = mm;
+    slider.nextElementSibling.textContent = mm;
+    this.$("[data-key=pupil]").checked = this.pupil = true;
     this.draw();
   }
 
@@ -179,8 +189,12 @@ export class Look {
     return { width, height, fov_deg: (Math.atan(width / 2 / focal) * 360) / Math.PI };
   }
 
+  get #focus_m() {
+    return centre(this.stack) + this.focus_mm / 1000;
+  }
+
   #paint(width, height, rays) {
-    const { display, mode } = this, g = display.g, pupil_mm = this.pupil ? 4 : 0;
+    const { display, mode } = this, g = display.g, pupil_mm = this.pupil ? 4 : 0, focus_m = this.#focus_m;
     const wide = width >= height, checks = mode === "target" || mode === "difference", two = checks || mode === "parallel" || mode === "crossed";
     const across = two && (checks ? this.#fitsSideBySide(width, height) : wide) ? 2 : 1, down = two && across === 1 ? 2 : 1, w = Math.floor(width / across), h = Math.floor(height / down);
     this.$(".over").replaceChildren();
@@ -201,11 +215,11 @@ export class Look {
     } else if (mode === "anaglyph") {
       for (const side of [0, 1]) {
         g.colorMask(side === 0, side === 1, side === 1, true);
-        display.see({ eye: this.eyes[side], picture: this.#picture(w, h), part: [0, 0, w, h], rays, pupil_mm, quick: this.quick });
+        display.see({ eye: this.eyes[side], picture: this.#picture(w, h), part: [0, 0, w, h], rays, pupil_mm, focus_m, quick: this.quick });
       }
       g.colorMask(true, true, true, true);
     } else {
-      sides.forEach((side, k) => display.see({ eye: this.eyes[side], picture: this.#picture(w, h), rays, pupil_mm, quick: this.quick,
+      sides.forEach((side, k) => display.see({ eye: this.eyes[side], picture: this.#picture(w, h), rays, pupil_mm, focus_m, quick: this.quick,
         part: [(k % across) * w, height - (Math.floor(k / across) + 1) * h, w, h] }));
     }
     this.#names(mode === "anaglyph" ? [] : sides.map((side, k) => [`${side ? "right" : "left"} eye`, ((k % across) + 0.5) / across, (Math.floor(k / across) + 1) / down]));
@@ -402,7 +416,8 @@ export class Look {
       else return;
       event.preventDefault();
     });
-    for (const box of this.$(".switches").querySelectorAll("input"))
+    this.$("[data-focus]").addEventListener("input", ({ target }) => this.focus(Number(target.value)));
+    for (const box of this.$(".switches").querySelectorAll("input[type=checkbox]"))
       box.addEventListener("change", () => {
         this[box.dataset.key] = box.checked;
         this.draw();
@@ -451,9 +466,10 @@ export class Look {
         }
         this.draw();
       },
+      focus: (mm) => this.focus(mm),
       picture: (eye, width, height, pupil_mm = 0) => {
         this.display.show(this.#draws());
-        return this.display.picture({ eye: this.eyes[eye], fov_deg: this.scene.fov_deg, pupil_mm }, width, height);
+        return this.display.picture({ eye: this.eyes[eye], fov_deg: this.scene.fov_deg, pupil_mm, focus_m: this.#focus_m }, width, height);
       },
     };
   }
