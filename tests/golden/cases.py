@@ -141,6 +141,11 @@ CASES = {
         },
         pictures=(50,),
     ),
+    "two-people": Case(
+        "two",
+        {"stack": {"x_m": (-0.09, -0.03, 0.03, 0.09)}, "content": {"scene": "demo"}, "tracker": {"join_s": 0.2}},
+        pictures=(60,),
+    ),
     # The effort is chosen, on a slow processor: coarse rasters in motion.
     "live-lean": Case("lean", {"model": {"effort": "auto"}, "loop": SLOW}),
 }

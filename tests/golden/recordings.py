@@ -11,8 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from runtime.clock import NS_PER_S
+from runtime.evaluation.motion_recording import write_motion
 from runtime.eyes.calibration import demo_sensor_from_stack
 from runtime.eyes.motions import observe, path_of, true_eyes
+from runtime.eyes.two_people import MOTIONS_OF_TWO
 from runtime.records import EyePoints, SensorFrame
 from runtime.sensor.recording import recording_to
 from runtime.sensor.recording_format import RecordingHeader
@@ -40,6 +42,7 @@ HEADS = {
     "loss-and-return": Head("lean", 2.6, seed=5, unseen_s=(0.5, 0.62), silent_s=(0.8, 2.0)),
     "nod": Head("nod", 2.0, seed=2),
     "lean": Head("lean", 1.4, rate_hz=60.0, seed=8),
+    "two": Head("two-one-leans", 1.2, seed=4),
 }
 
 
@@ -51,6 +54,9 @@ def path_to(name: str) -> Path:
 def write(name: str, path: Path) -> None:
     """Write one of HEADS: the same samples from the same generator."""
     head = HEADS[name]
+    if head.motion in MOTIONS_OF_TWO:
+        write_motion(path, head.motion, seed=head.seed, seconds=head.seconds, noise_mm=head.noise_mm)
+        return
     way = path_of(head.seed)
     observed = observe(
         head.motion,
