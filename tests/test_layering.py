@@ -40,7 +40,7 @@ def test_no_module_imports_in_a_circle_not_even_inside_a_function() -> None:
         (["ctl", "pause"], ()),
         (
             ["run", "--replay", "demo", "--headless", "--max-speed", "--frames", "1", "--scale", "0.05"],
-            ("numpy", "cv2", "onnxruntime", "moderngl", "scipy"),  # scenes turn by its Rotation
+            ("numpy", "cv2", "onnxruntime", "moderngl"),
         ),
     ],
     ids=lambda value: " ".join(value[:2]) or "nothing",

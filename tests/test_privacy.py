@@ -45,7 +45,8 @@ def run_traced(folder: Path, *arguments: str) -> tuple[list[str], list[str]]:
         call, given = match[1], match[2]
         if call in ("socket", "connect", "bind", "sendto", "sendmsg"):
             local = "AF_UNIX" in given or "AF_LOCAL" in given
-            if (call == "socket" and not local) or (call != "socket" and NAME_SERVICE not in given):
+            connected = call == "sendmsg" and "msg_name=NULL" in given  # by a connect in this trace, or a socketpair
+            if (call == "socket" and not local) or (call != "socket" and NAME_SERVICE not in given and not connected):
                 sockets.append(line)
         elif call not in ("open", "openat") or WRITES.search(given):
             name = next(iter(reversed(QUOTED.findall(given))), "")
