@@ -67,7 +67,7 @@ noise. The simulated costs match a slow processor (in ms on the full raster: ren
 inference 31, finish 38, each step 85). In the row *film*, the content moves while the head rests.
 
 An [effort](mathematics.md#effort) combines a raster with a number of steps: `1/2+0` means half the
-raster and no steps. *Full* runs the whole model for every solution. *Auto*, the default, chooses an
+raster and no steps. *Auto*, the default, chooses an
 effort for each solution. The table gives [live quality](contracts.md#error) in dB, the view error in
 mm (median and 95th percentile) and each effort's share of the time. Between solutions, the picture is
 [reprojected](mathematics.md#reprojection) according to its depth.
