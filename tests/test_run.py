@@ -179,8 +179,8 @@ def test_kept_light_is_what_the_panels_show_with_what_the_judge_needs(runs: tupl
         pictures = {f"{name}-{eye}.png" for name in ("drawn", "true") for eye in ("left", "right")}
         assert names == {*LAYERS, *pictures, "light.json"}
         told = json.loads((folder / "light.json").read_text())
-        assert set(told) == {"solved_for_m", "eyes_m", "true_eyes_m", "fov"}
-        for name in ("solved_for_m", "eyes_m", "true_eyes_m"):
+        assert set(told) == {"solved_for_m", "eyes_m", "true_eyes_m", "fov", "people"}
+        for name in ("solved_for_m", "eyes_m", "true_eyes_m", "people"):
             assert told[name] == lines[frame][name]
     last = read_image(runs[0] / "light" / "59" / "layer-0.png")
     assert np.array_equal(last, read_image(runs[0] / "layer-0.png"))  # the run's own last picture is the aligned one
