@@ -43,9 +43,9 @@ def settings(source: str) -> SensorSettings:
 def test_without_depth_the_eyes_direction_is_right_with_sigma_along_it(film: str) -> None:
     sensor = settings(film)
     driver = open_sensor(sensor, MonotonicClock())
-    find = EyeFinder(Settings(sensor=sensor)).find_all
+    finder = EyeFinder(Settings(sensor=sensor))
     with driver:
-        frames = [searched(driver.read_newest(1.0), find) for _ in range(5)]
+        frames = [searched(driver.read_newest(1.0), finder) for _ in range(5)]
         with pytest.raises(SensorLost, match="stopped delivering pictures"):
             driver.read_newest(1.0)
     assert [frame.sequence for frame in frames] == [1, 2, 3, 4, 5]
