@@ -82,6 +82,7 @@ def test_an_endless_model_is_refused_and_hangs_no_thread_of_the_daemon(
         served.rig.refresh_until_solved()
 
 
+@pytest.mark.slow
 def test_a_scene_that_takes_all_memory_ends_only_its_reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import trimesh
 

@@ -159,6 +159,7 @@ def test_a_step_is_bounded_by_the_curvature_and_its_floor() -> None:
         assert (x - new).numpy() == pytest.approx(np.full((2, 1, 2, 2), moved), abs=1e-12)
 
 
+@pytest.mark.slow
 def test_the_example_that_bounds_what_panels_could_show_runs(tmp_path: Path, still: tuple[PanelStack, Any]) -> None:
     for name, target in zip(("left.png", "right.png"), still[1], strict=True):
         write_png(tmp_path / name, (target * 255).round().byte().permute(1, 2, 0).numpy())

@@ -375,6 +375,7 @@ def test_on_the_processor_only_panels_that_change_are_drawn() -> None:
     assert list(sink.drawn(PanelFrame(4, smooth(2), 2, moved.solved_from_shown))) == [0, 1, 2]
 
 
+@pytest.mark.slow
 @given(st.lists(st.sampled_from([1, 2, 3, 4]), min_size=2, max_size=6))
 def test_on_the_processor_nothing_remains_of_an_earlier_raster(reductions: list[int]) -> None:
     """Solutions of all rasters share their memory."""

@@ -88,6 +88,7 @@ def own_cases(folder: Path) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_cases_are_grouped_by_stack_and_another_solver_s_layers_join_them(tmp_path: Path) -> None:
     cases, started = own_cases(tmp_path / "cases"), set()
 
