@@ -3,6 +3,7 @@
 from runtime.config.files import changed, load_settings, load_stack, with_options
 from runtime.config.settings import (
     MOST,
+    PLACING,
     TWO_VIEWERS_PANELS,
     CalibrationSettings,
     ContentSettings,
@@ -21,6 +22,7 @@ from runtime.support.sections import Section, read_table, validated
 
 __all__ = [
     "MOST",
+    "PLACING",
     "TWO_VIEWERS_PANELS",
     "CalibrationSettings",
     "ContentSettings",

@@ -217,6 +217,8 @@ class CalibrationSettings(Section):
 LAYOUT = (
     r"^(auto|mono|(half-)?(side-by-side|top-bottom|cross-eyed)|anaglyph|rgbd|qs\d{1,6}x\d{1,6}(a(\d+(\.\d+)?|\.\d+))?)$"
 )
+# Settings of the content that place it, which `phasestack ctl place` changes while it runs.
+PLACING = ("scale", "offset_m", "rotation_deg", "turntable_per_min", "convergence_m", "comfort_deg")
 
 
 class ContentSettings(Section):

@@ -36,6 +36,7 @@ class View:
     height_px: int
     reduction: int = 1  # display pixels per raster pixel, in each direction; outlines keep their width on the display
     display_from_view: F64 | None = None  # 3x3 rotation of a moved scene; the lamp is fixed to the display
+    comfort_deg: float = 0.0  # limit for the depth of live stereo pictures; 0 for none
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +57,6 @@ class ContentSource(ABC):
 
     Options: ClassVar[type[BaseModel]] = Section  # model that validates [content.options] for a user-defined scene
     info: ContentInfo
-    comfort_deg: float = 0.0  # limit for the depth of live stereo pictures; 0 for none
     draws_in: object = None  # GL context that owns the textures `draw` returns, or None if the source returns arrays
 
     def __init__(self, options: Any, *, stack: Any, context: Any) -> None:

@@ -119,10 +119,10 @@ class LiveSource(ContentSource):
     def _picture_from_view(self, view: View) -> F64 | None:
         """Return the homography from a view's pixels to those of the picture, which stands where it is comfortable."""
         plane_from_view = plane_from_pixels(view.pixels_from_stack, self._screen)
-        if plane_from_view is None or not self.comfort_deg or self._depths is None or len(self._views) < 2:
+        if plane_from_view is None or not view.comfort_deg or self._depths is None or len(self._views) < 2:
             return plane_from_view
         width_m = self._screen.width_px * self._screen.pitch_u_m
-        most_m = np.radians(self.comfort_deg) * max(view.eye_m[0], 0.0)
+        most_m = np.radians(view.comfort_deg) * max(view.eye_m[0], 0.0)
         far, near = self._depths
         shift_m, scale = comfort.adjusted(far * width_m, near * width_m, most_m)
         middle = self._screen.width_px / 2, self._screen.height_px / 2
@@ -155,11 +155,11 @@ class LiveSource(ContentSource):
         aspect = layout.pixel_aspect(width_px=width, height_px=height)
         self._screen = screen(self._file.stack, width_px=width, height_px=height, pixel_aspect=aspect)
         self._views, self._at, self._shown = parts, newest.number, {}
-        self._measure()
+        self._measure(is_limited=views[0].comfort_deg > 0)
 
-    def _measure(self) -> None:
+    def _measure(self, *, is_limited: bool) -> None:
         """Follow the depth of the views, if it is limited."""
-        if not self.comfort_deg or len(self._views) != 2:
+        if not is_limited or len(self._views) != 2:
             self._depths = None
             return
         if self._depths is not None and self._at < self._measured + MEASURED_EVERY:

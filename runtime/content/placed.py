@@ -12,19 +12,11 @@ from typing import Any
 import numpy as np
 
 from runtime.clock import NS_PER_S
-from runtime.config import ContentSettings
+from runtime.config import PLACING, ContentSettings
 from runtime.content.base import ContentInfo, ContentSource, ForwardingSource, View
 from runtime.content.presets import rotation_matrix
 from runtime.records import F64
 
-FIELDS = (
-    "scale",
-    "offset_m",
-    "rotation_deg",
-    "turntable_per_min",
-    "convergence_m",
-    "comfort_deg",
-)  # fields of ContentSettings
 NS_PER_MIN = 60 * NS_PER_S
 
 
@@ -56,21 +48,13 @@ class Placing:
 
 def placing_of(settings: ContentSettings) -> Placing:
     """Return the placement specified by the settings."""
-    return Placing(
-        settings.scale,
-        settings.offset_m,
-        settings.rotation_deg,
-        settings.turntable_per_min,
-        settings.convergence_m,
-        settings.comfort_deg,
-    )
+    return Placing(**{name: getattr(settings, name) for name in PLACING})
 
 
 def placed_source(source: ContentSource, placing: Placing) -> ContentSource:
     """Return a source that shows `source` with a placement that replaces any earlier one."""
     if isinstance(source, PlacedSource):
         source = source.source
-    source.comfort_deg = placing.comfort_deg
     return source if placing == Placing() else PlacedSource(source, placing)
 
 
@@ -93,12 +77,14 @@ class PlacedSource(ForwardingSource):
         turn = matrix[:3, :3] / self.placing.scale
         eye = turn.T @ (view.eye_m - matrix[:3, 3]) / self.placing.scale
         lit = turn if view.display_from_view is None else view.display_from_view @ turn
-        pixels_from_scene = view.pixels_from_stack @ matrix
-        return (
-            self.source,
-            View(eye, view.side, pixels_from_scene, view.width_px, view.height_px, view.reduction, lit),
-            time_ns,
+        moved = replace(
+            view,
+            eye_m=eye,
+            pixels_from_stack=view.pixels_from_stack @ matrix,
+            display_from_view=lit,
+            comfort_deg=self.placing.comfort_deg or view.comfort_deg,
         )
+        return self.source, moved, time_ns
 
     def revision(self, *, time_ns: int) -> int:
         return time_ns if self.placing.turntable_per_min else self.source.revision(time_ns=time_ns)

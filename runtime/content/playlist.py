@@ -14,9 +14,8 @@ from typing import Annotated, Any
 from pydantic import Field, field_validator
 
 from runtime.clock import NS_PER_S
-from runtime.config import ContentSettings, Section, read_table, validated
+from runtime.config import PLACING, ContentSettings, Section, read_table, validated
 from runtime.content.base import ContentInfo, ContentSource, ForwardingSource, View
-from runtime.content.placed import FIELDS
 from runtime.errors import InputError
 from runtime.support.picture_header import CAMERA_SET
 from runtime.support.plausible import within
@@ -72,7 +71,7 @@ def read_playlist(path: Path, settings: ContentSettings) -> Playlist:
             path, "show", "is missing; a JSON file must be a playlist, with its scenes listed under `show`"
         )
     file = validated(PlaylistFile, table, source=path)
-    common = settings.model_dump(exclude={"scene", "file", *FIELDS})
+    common = settings.model_dump(exclude={"scene", "file", *PLACING})
     entries = []
     for number, own in enumerate(file.show):
         places = {

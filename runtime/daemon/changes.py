@@ -11,9 +11,9 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-from runtime.config import Settings, changed
+from runtime.config import PLACING, Settings, changed
 from runtime.daemon import status
-from runtime.daemon.commands import PLACING, Command
+from runtime.daemon.commands import Command
 from runtime.daemon.reconfigure import moved_since
 from runtime.errors import InputError, PhasestackError
 from runtime.eyes.calibration import Calibration, load_calibration

@@ -6,18 +6,11 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
+from runtime.config import PLACING
 from runtime.support.untrusted_input import shown
 
 Name = Literal["scene", "next", "place", "model", "pause", "resume", "flat", "reload", "blackbox"]
 NAMES: tuple[Name, ...] = get_args(Name)
-PLACING = (
-    "scale",
-    "offset_m",
-    "rotation_deg",
-    "turntable_per_min",
-    "convergence_m",
-    "comfort_deg",
-)  # settings in [content] changed by `place`
 
 
 @dataclass(frozen=True, slots=True)

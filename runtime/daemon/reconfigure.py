@@ -6,10 +6,9 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from runtime.config import ContentSettings, Settings
+from runtime.config import PLACING, ContentSettings, Settings
 from runtime.content.placed import placed_source, placing_of
 from runtime.content.registry import Opener, prepare_content
-from runtime.daemon.commands import PLACING
 from runtime.errors import PhasestackError, Stopped
 from runtime.frame.run_state import SceneCell
 from runtime.model.base import trial_eyes_m

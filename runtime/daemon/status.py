@@ -14,13 +14,12 @@ import numpy as np
 
 from runtime.browser.link import BrowserLink
 from runtime.clock import NS_PER_MS
-from runtime.config import ContentSettings, Settings
+from runtime.config import PLACING, ContentSettings, Settings
 from runtime.content.frames import PICTURES
 from runtime.content.presets import preset_names
 from runtime.content.registry import MESHES, PLAYLISTS, SPLATS
 from runtime.content.scenes import SCENES
 from runtime.daemon.build import Run
-from runtime.daemon.commands import PLACING
 from runtime.evaluation.refresh_quality import view_error_mm
 from runtime.frame.presenter import Presenter, Refresh
 from runtime.model.predictor import SHIPPED

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -82,7 +83,8 @@ def test_a_pipe_is_shown_within_the_limit(tmp_path: Path, comfort_deg: float) ->
 
 def test_the_limit_can_be_changed_while_it_runs() -> None:
     inner = open_content(ContentSettings(scene="program"), STACK, None)
-    placed = placed_source(inner, Placing(comfort_deg=1.0))
-    assert inner.comfort_deg == 1.0
-    assert placed_source(placed, Placing()) is inner and inner.comfort_deg == 0.0
+    placed: Any = placed_source(inner, Placing(comfort_deg=1.0))
+    view = raster_views(EYES, STACK.panel(1))[0]
+    assert placed.forwarded(view, 0)[1].comfort_deg == 1.0
+    assert placed_source(placed, Placing()) is inner and view.comfort_deg == 0.0
     inner.close()
