@@ -37,7 +37,7 @@ from runtime.optics.real.panels import RealPanels
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack
-from runtime.records import F64, U8
+from runtime.records import F32, F64, U8
 from runtime.support.artifacts import OutputFolder, write_json
 from runtime.support.progress import ShownProgress
 from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG, SEPARATION_MIN_M, refusal
@@ -87,6 +87,7 @@ class Solving(TypedDict, total=False):
     """Further options of `solve`."""
 
     steps: int | None  # number of steps of a solution; None: as many as the model was made for
+    floats: bool  # True: keep the layers also as they are before rounding (`Result.floats`)
 
 
 class Result:
@@ -95,12 +96,16 @@ class Result:
     """
 
     layers: U8  # (panels, h, w, 3), rear to front
+    floats: F32 | None  # (panels, h, w, 3) in 0..1, the layers before rounding; None without `floats=True`
     model: str  # name of the model used, with a note if its network does not support the stack
     eye_sigma_mm: float  # tracking error that the layers were computed for
     total_ms: float  # time the solver took, without loading the model
 
-    def __init__(self, layers: U8, pair: _Pair, *, model: str, eye_sigma_mm: float, total_ms: float) -> None:
-        self.layers, self.model, self.eye_sigma_mm, self.total_ms = layers, model, eye_sigma_mm, total_ms
+    def __init__(
+        self, layers: U8, pair: _Pair, *, floats: F32 | None, model: str, eye_sigma_mm: float, total_ms: float
+    ) -> None:
+        self.layers, self.floats = layers, floats
+        self.model, self.eye_sigma_mm, self.total_ms = model, eye_sigma_mm, total_ms
         self._asked = pair
 
     def __repr__(self) -> str:
@@ -178,7 +183,7 @@ class Result:
         told["total_ms"] = round(self.total_ms, 3)
         try:
             with OutputFolder(checked_path(_folder(out))) as folder:
-                self._pair.write(folder.staging, lines=[self._line, *self.notes])
+                self._pair.write(folder.staging, lines=[self._line, *self.notes], floats=self.floats)
                 write_json(folder.staging / "solve.json", self._pair.quality.table() | told)
         except InputError as error:
             raise ValueError(f"out: {error}") from None
@@ -234,7 +239,8 @@ def solve(
         model: `fast`, `balanced`, `best`, `sart`, or the path to an ONNX file.
         eye_sigma_mm: Tracking error to allow for: 1 suits a good tracker, and 0 assumes exact positions.
         **how: `steps`, the number of updates of all panels after the network's proposal or, for `sart`, its iterations.
-            By default, as many as the model was made for.
+            By default, as many as the model was made for. `floats=True` also keeps the layers before rounding, as
+            `Result.floats`; all pixels are then solved, even where this is unnecessary.
 
     Raises:
         ValueError: An argument is invalid. The message begins with the argument's name.
@@ -244,6 +250,9 @@ def solve(
     pair = _checked(left, right, stack=stack, eyes_m=eyes_m, fov_deg=fov_deg, cameras=cameras)
     steps = how.get("steps")
     steps = None if steps is None else _whole("steps", steps, STEPS_MOST)
+    floats = how.get("floats", False)
+    if not isinstance(floats, bool):
+        raise ValueError(f"floats: must be True or False, not {floats!r}")
     eye_sigma_mm = _number("eye_sigma_mm", eye_sigma_mm, 0.0, 1000.0, "mm")
     with _one_at_a_time:
         try:
@@ -260,6 +269,7 @@ def solve(
                 eye_sigma_mm=eye_sigma_mm,
                 trimmed=True,
                 steps=steps,
+                floats=floats,
             )
             total_ms = (time.perf_counter_ns() - start_ns) / 1e6
             layers = np.ascontiguousarray(solved.layers[..., :3])
@@ -267,7 +277,8 @@ def solve(
             raise ValueError(str(error) if error.source == "model" else f"model: {error}") from None
         except ModelFailure as error:
             raise ValueError(f"eyes_m: {error}") from None
-    return Result(layers, pair, model=predictor.name_with(len(codes)), eye_sigma_mm=eye_sigma_mm, total_ms=total_ms)
+    name = predictor.name_with(len(codes))
+    return Result(layers, pair, floats=solved.floats, model=name, eye_sigma_mm=eye_sigma_mm, total_ms=total_ms)
 
 
 def solve_each(

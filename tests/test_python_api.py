@@ -602,6 +602,26 @@ def test_steps_that_are_none_are_refused(steps: Any) -> None:
         phasestack.solve(pair.left, pair.right, eyes_m=pair.eyes_m, stack=pair.stack, steps=steps)
 
 
+@pytest.mark.parametrize("model", ["fast", "sart"])
+def test_float_layers_are_the_layers_before_rounding(model: str, tmp_path: Path) -> None:
+    pair = phasestack.example_pair()
+    how: Any = {"eyes_m": pair.eyes_m, "stack": pair.stack, "fov_deg": pair.fov_deg, "model": model}
+    assert phasestack.solve(pair.left, pair.right, **how).floats is None
+    result = phasestack.solve(pair.left, pair.right, floats=True, **how)
+    assert result.floats is not None and result.floats.dtype == np.float32
+    exact = result.floats.astype(float) * 255
+    assert exact.min() >= 0 and exact.max() <= 255
+    assert np.abs(exact - result.layers).max() < 0.501 and np.abs(exact - result.layers).mean() > 0.1
+    result.save(tmp_path)
+    assert (np.load(tmp_path / "layers.npy") == result.floats).all()
+
+
+def test_floats_must_be_true_or_false() -> None:
+    pair = phasestack.example_pair()
+    with pytest.raises(ValueError, match=r"^floats: must be True or False"):
+        phasestack.solve(pair.left, pair.right, eyes_m=pair.eyes_m, stack=pair.stack, floats=1)  # type: ignore[arg-type]
+
+
 def test_obvious_ghosts_are_noted() -> None:
     rng, (height, width) = np.random.default_rng(1), (180, 320)
     noise = [rng.integers(0, 256, (height, width, 3)).astype(np.uint8) for _ in range(2)]

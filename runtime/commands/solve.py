@@ -63,6 +63,9 @@ def solve(
     no_plan: Annotated[
         bool, typer.Option("--no-plan", help="solve every pixel, even where this is unnecessary")
     ] = False,
+    floats: Annotated[
+        bool, typer.Option("--floats", help="also write layers.npy, the layers before rounding to 8 bits")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print the contents of solve.json")] = False,
 ) -> None:
     """Compute the layers for still pictures, and measure how well each eye sees its picture.
@@ -100,6 +103,7 @@ def solve(
             eye_sigma_mm=eye_sigma_mm,
             backend=backend,
             plan=not no_plan,
+            floats=floats,
         )
     typer.echo(shown(result, as_json=as_json))
     if not as_json:

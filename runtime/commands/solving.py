@@ -121,6 +121,7 @@ def solve_pictures(
     eye_sigma_mm: float,
     backend: str | None,
     plan: bool,
+    floats: bool,
 ) -> dict[str, Any]:
     """Solve pictures, write the layers and the eyes' views, and return the contents of solve.json. Raises
     InputError if an option or the given eye positions cannot be used.
@@ -154,6 +155,7 @@ def solve_pictures(
                 predictor=predictor,
                 eye_sigma_mm=eye_sigma_mm,
                 trimmed=plan,
+                floats=floats,
             )
             inference_ms.append(prediction.stage_ms["inference"])
             return prediction
@@ -180,7 +182,7 @@ def solve_pictures(
             line = f"{asked.name}, model {predictor.name_with(len(pictures))}, solved for a tracking error of "
             line += f"{eye_sigma_mm:g} mm; PSNR with one ray per pixel, as published: {quality.psnr_db:.1f} dB"
             tell("writing", 0)
-            seen.write(folder.staging, lines=[line, *notes])
+            seen.write(folder.staging, lines=[line, *notes], floats=done.answer.floats)
             watch.lap("measure and write")
             items = network_items(ContentInfo(asked.name), Measured(left_out=done.answer.savings))
             result = quality.table() | {

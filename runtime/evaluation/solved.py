@@ -13,8 +13,8 @@ from runtime.evaluation.contact_sheet import contact_sheet, headline
 from runtime.evaluation.displayed import SIGMAS_MM, EyeViews, Picture, displayed, expected_quality
 from runtime.optics.light import LIGHT, ONE_RAY
 from runtime.optics.stack import PanelStack
-from runtime.records import U8, Eyes
-from runtime.support.artifacts import write_png, write_text
+from runtime.records import F32, U8, Eyes
+from runtime.support.artifacts import write_npy, write_png, write_text
 
 BySigma = Mapping[str, float]
 GROUPS = 10  # number of row groups used to estimate the standard error of sampled light
@@ -94,10 +94,12 @@ class SolvedPair:
         """Return an HTML viewer page for the layers, with lines of text below the headline."""
         return self.eye_views.viewer(self.layers, [headline(self.quality.light_db["1"]), *lines])
 
-    def write(self, folder: Path, *, lines: Sequence[str]) -> None:
-        """Write the layers, eye views, contact sheet and viewer page to a folder."""
+    def write(self, folder: Path, *, lines: Sequence[str], floats: F32 | None = None) -> None:
+        """Write the layers, also as `floats` before rounding, eye views, contact sheet and viewer page to a folder."""
         for n, layer in enumerate(self.layers):
             write_png(folder / f"layer-{n}.png", layer)
+        if floats is not None:
+            write_npy(folder / "layers.npy", floats)
         self.eye_views.write(folder)
         sheet = contact_sheet(self.layers, self.eye_views, headline=headline(self.quality.light_db["1"]), lines=lines)
         write_png(folder / "contact-sheet.png", sheet)

@@ -13,7 +13,7 @@ import numpy as np
 from runtime.clock import Stopwatch
 from runtime.model.job import Job, Savings, grey_job
 from runtime.optics.stack import PanelStack
-from runtime.records import F64, SOLVING_STAGES, U8, Eyes
+from runtime.records import F32, F64, SOLVING_STAGES, U8, Eyes
 
 if TYPE_CHECKING:
     from runtime.model.buffers import LayerSlots
@@ -40,6 +40,7 @@ class Prediction:
     layers: U8  # (N, height_px, width_px, 4) RGBA, rear to front, sized like the job's stack; read-only
     stage_ms: dict[str, float] = field(default_factory=dict)  # time taken by each of STAGES
     savings: Savings = field(default_factory=Savings)
+    floats: F32 | None = None  # (N, height_px, width_px, 3) in [0, 1], the layers before rounding; None: not requested
     steps: int = 0  # updates of all panels, including those made by earlier solutions that were continued
     continued_from: int | None = None  # how many of `steps` earlier solutions made; None: no solution was continued
 

@@ -108,6 +108,7 @@ class Job:
     eye_sigma_m: float = TRACKING_SIGMA_M
     window: SolveWindow | None = None  # None: solve everything the eyes see
     channels: int = 3  # 1: the pictures are grey, and one channel is solved for all three
+    floats: bool = False  # also return the values before they are rounded; only without a window
     steps: int | None = None  # maximum number of updates of all panels; None: as specified by the model
     continued: bool = False  # start from the previous solution's panels if its rays were the same
     deadline_ns: int | None = None  # no step begins after this time (`time.perf_counter_ns`); None: no limit

@@ -72,7 +72,8 @@ class SartPredictor(Predictor):
                 raise ModelFailure("the solver diverged")
             layers[n, ..., :3] = np.rint(panel * 255)
         watch.lap("finish")
-        return Prediction(layers, watch.stage_ms, job.savings, self.iterations)
+        floats = np.stack(panels) if job.floats else None
+        return Prediction(layers, watch.stage_ms, job.savings, floats, self.iterations)
 
     def _panel_from_middle(self, eye_m: F64, index: int) -> F64:
         """Return the 3x3 homography from middle-panel to layer pixels along an eye's rays, as OpenCV counts."""

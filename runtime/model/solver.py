@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from runtime.clock import Stopwatch
+from runtime.kernels import FULL
 from runtime.model.base import STAGES, Prediction, Predictor
 from runtime.model.buffers import LayerBuffer, LayerPool, LayerSlots
 from runtime.model.contract import Places, Step
@@ -24,7 +25,7 @@ from runtime.model.job import Job
 from runtime.model.proposal import Proposal, tapered
 from runtime.optics.malus import rest_code
 from runtime.optics.stack import PanelStack
-from runtime.records import I16
+from runtime.records import F32, I16
 
 _Done = tuple[int, int | None]  # number of steps, and how many of them earlier solutions made; None: not continued
 COARSE = ((8, 16), (4, 16), (2, 12))  # without a network: divisors of the first rasters, and steps on each
@@ -54,6 +55,14 @@ def enlarged(codes: I16, n: int, coarse: Geometry, geometry: Geometry) -> I16:
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     size = box.width_px, box.height_px
     return np.asarray(cv2.warpAffine(codes, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE), np.int16)
+
+
+def _unrounded(buffer: LayerBuffer, geometry: Geometry, state: SolverState) -> F32:
+    """Return the layers just written to a buffer, without rounding: (N, rows, columns, 3) in [0, 1]."""
+    layers = buffer.pixels[..., :3].astype(np.float32) / np.float32(255)
+    for n, box in enumerate(geometry.boxes):
+        layers[n][box.slices] = state.panel(n).astype(np.float32) / np.float32(FULL)
+    return layers
 
 
 class StepPredictor(Predictor):
@@ -124,9 +133,11 @@ class StepPredictor(Predictor):
         pool = self._pools[job.stack]
         buffer, rest, window = pool.take(), rest_code(job.stack.count), job.window
         done: _Done = 0, None
+        floats: F32 | None = None
         if window is None:  # solve everything the eyes see, or all pixels if the network proposes whole panels
             geometry = job.targets.visible if self.any_raster else job.targets.every_pixel
             done = self._improve(job, geometry, state, buffer, watch, outside=rest)
+            floats = _unrounded(buffer, geometry, state) if job.floats else None
         else:
             if window.colour is None or not window.box.width_px:  # fill with the picture that both eyes see
                 self._improved = None
@@ -136,7 +147,7 @@ class StepPredictor(Predictor):
             if window.box.width_px:
                 done = self._improve(job, job.targets.within(window), state, buffer, watch, outside=window.colour)
         watch.lap("finish")
-        return Prediction(buffer.handed_over(), watch.stage_ms, job.savings, *done)
+        return Prediction(buffer.handed_over(), watch.stage_ms, job.savings, floats, *done)
 
     def _improve(
         self,

@@ -29,16 +29,18 @@ def solve_still(
     eye_sigma_mm: float = TRACKING_SIGMA_MM,
     trimmed: bool = False,
     steps: int | None = None,
+    floats: bool = False,
 ) -> Prediction:
     """Compute the layers for each eye's picture, taken by a camera at the eye that is aimed at the
     stack's origin. The solver follows the rays of the picture pixels. `trimmed` skips work that the pictures do not
-    need, if the model supports it; `steps` defaults to the model's.
+    need, if the model supports it and `floats`, the layers before rounding, are not requested; `steps` defaults to the
+    model's.
     """
     watch = Stopwatch(*STAGES)
     codes = [np.ascontiguousarray(picture[..., :3]) for picture in pictures]
     views = captured_views(codes, eyes_m, predictor.stack, fov_deg=fov_deg)
-    job = Job(Targets(predictor.stack, eyes_m, views), eye_sigma_m=eye_sigma_mm / 1e3, steps=steps)
-    if trimmed and predictor.trims:
+    job = Job(Targets(predictor.stack, eyes_m, views), eye_sigma_m=eye_sigma_mm / 1e3, steps=steps, floats=floats)
+    if trimmed and not floats and predictor.trims:
         job = trim(job)
     watch.lap("prepare")
     return predictor.solve(job, watch)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import io
 import json
 import os
 import shutil
@@ -19,7 +20,7 @@ from typing import Any, Self
 import numpy as np
 
 from runtime.errors import InputError
-from runtime.records import U8
+from runtime.records import F32, U8
 
 STAGING = ".phasestack-staging-"
 UMASK = os.umask(0o022)  # the system reports the mask only when it is set
@@ -42,7 +43,7 @@ def put_in_place(part: Path, path: Path) -> None:
     sync(path.parent)
 
 
-def write_bytes(path: Path, data: bytes, *, like: Path | None = None) -> None:
+def write_bytes(path: Path, data: bytes | memoryview, *, like: Path | None = None) -> None:
     """Write a file atomically and create missing folders. Raises InputError if that fails. Owner and mode
     are those of the file `like`, by default of the replaced file.
     """
@@ -122,6 +123,13 @@ def png_bytes(image: U8) -> bytes:
 def write_png(path: Path, image: U8) -> None:
     """Write an image as a PNG file atomically (`png_bytes`). Raises InputError if it cannot be written."""
     write_bytes(path, png_bytes(image))
+
+
+def write_npy(path: Path, array: F32) -> None:
+    """Write an array as a NumPy file atomically. Raises InputError if it cannot be written."""
+    buffer = io.BytesIO()
+    np.save(buffer, array, allow_pickle=False)
+    write_bytes(path, buffer.getbuffer())
 
 
 def refuse_file(out: Path) -> None:

@@ -68,3 +68,11 @@ def test_pictures_that_differ_everywhere_leave_nothing_out(tmp_path: Path) -> No
         write_png(tmp_path / f"{name}.png", random.integers(0, 256, (270, 480, 3), np.uint8))
     result = solved(tmp_path)
     assert result["plan"] == [] and result["steps"] == 5
+
+
+def test_floats_are_the_layers_before_rounding_without_a_window(tmp_path: Path) -> None:
+    pictures(tmp_path, grey=True)
+    assert solved(tmp_path, "--floats")["plan"] == []
+    floats, layer = np.load(tmp_path / "out/layers.npy"), cv2.imread(str(tmp_path / "out/layer-2.png"))
+    assert floats.shape == (3, 270, 480, 3) and floats.dtype == np.float32
+    assert layer is not None and np.abs(floats[2] * 255 - layer[..., ::-1]).max() < 0.501
