@@ -38,13 +38,13 @@ test-slow: $(VENV)/.test
 golden: $(VENV)/.test
 	$(BIN)/python -m tests.golden --renew $(GOLDEN_ARGS)
 
-# Style, layers, spelling, prose, shell. `pre-commit install` runs them, with types and secrets, before every commit.
+# Style, layers, spelling, prose, docstrings' examples, shell. `pre-commit install` runs them, with types and secrets, before every commit.
 lint: $(VENV)/.test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 	$(BIN)/typos
-	$(BIN)/python -m pytest -q tests/test_prose.py
+	$(BIN)/python -m pytest -q --doctest-modules tests/test_prose.py runtime/errors.py runtime/support
 	$(BIN)/shellcheck .ci/run systemd/*.sh requirements/*.sh docs/*.sh systemd/x-authority systemd/back-off
 
 types: $(VENV)/.test

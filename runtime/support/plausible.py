@@ -14,19 +14,7 @@ PART_MAX_BYTES = 255  # maximum length of each part of a path
 
 
 def within(low: float, high: float, unit: str, *, zero: bool = False) -> AfterValidator:
-    """Return a validator for numbers in a range. Its message suggests which unit was used by mistake.
-
-    Args:
-        low: Smallest valid number, finite.
-        high: Largest valid number, finite.
-        unit: Unit of the number, such as `m`.
-        zero: Also accept 0, with the meaning "not set".
-
-    Examples:
-        >>> within(0.005, 20.0, "m").func(518.4)
-        Traceback (most recent call last):
-        ValueError: 518.4 m is out of range; for 518.4 millimetres, write 0.5184
-    """
+    """Return a validator for numbers in a range, with the messages of `refusal`. `zero` also accepts 0, "not set"."""
 
     def check(value: float) -> float:
         problem = "" if zero and value == 0 else refusal(value, low, high, unit)

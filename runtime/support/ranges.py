@@ -20,19 +20,12 @@ OTHER_UNITS = {
 
 def refusal(value: float, low: float, high: float, unit: str = "") -> str:
     """Return an error message for a number out of range, or an empty string if the number is in range.
+    For m, s and ms, the message suggests a smaller unit if the number would be valid in that unit.
 
-    Args:
-        value: Number to check.
-        low: Smallest valid number, finite.
-        high: Largest valid number, finite.
-        unit: Unit of the number. For m, s and ms, the message suggests a smaller unit if the number would be valid in
-            that unit.
-
-    Examples:
-        >>> refusal(518.4, 0.005, 20.0, "m")
-        '518.4 m is out of range; for 518.4 millimetres, write 0.5184'
-        >>> refusal(51.84, 0.005, 20.0, "m")
-        '51.84 m is out of range; for 51.84 centimetres, write 0.5184; for 51.84 millimetres, write 0.05184'
+    >>> refusal(518.4, 0.005, 20.0, "m")
+    '518.4 m is out of range; for 518.4 millimetres, write 0.5184'
+    >>> refusal(51.84, 0.005, 20.0, "m")
+    '51.84 m is out of range; for 51.84 centimetres, write 0.5184; for 51.84 millimetres, write 0.05184'
     """
     if low <= value <= high:
         return ""
