@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import os
-import signal
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +12,7 @@ from pydantic import Field
 from runtime.config import Section
 from runtime.content.base import ContentInfo, ContentSource, View
 from runtime.errors import ContextLost
-
-
-def _loop() -> None:
-    while True:
-        pass
+from tests.deeds import DEEDS
 
 
 def _grow() -> None:
@@ -33,16 +26,7 @@ def _lose_context() -> None:
     raise ContextLost("the driver reset the GPU")
 
 
-DEEDS: dict[str, Any] = {
-    "crash": lambda: ctypes.string_at(0),
-    "die": lambda: os.kill(os.getpid(), signal.SIGKILL),
-    "stop": lambda: os.kill(os.getpid(), signal.SIGSTOP),
-    "loop": _loop,
-    "sleep": lambda: ctypes.CDLL(None).sleep(3600),
-    "exit": lambda: sys.exit("no licence"),
-    "grow": _grow,
-    "lose": _lose_context,
-}
+SCENE_DEEDS = DEEDS | {"grow": _grow, "lose": _lose_context}
 
 
 class HarmfulOptions(Section):
@@ -74,4 +58,4 @@ class Harmful(ContentSource):
         if self._file.name and self._file.exists():
             deed = self._file.read_text(encoding="utf-8").strip()
             self._file.unlink()
-            DEEDS[deed]()
+            SCENE_DEEDS[deed]()

@@ -21,10 +21,7 @@ STEP_S = 5.0
 MEMORY_BYTES = 1 << 29
 REASONS = {
     "crash": "SIGSEGV",
-    "die": "SIGKILL",
-    "stop": "has not answered",
     "loop": "has not answered",
-    "sleep": "has not answered",
     "grow": "memory limit",
     "lose": "the driver reset the GPU",
 }

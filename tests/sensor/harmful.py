@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
-import signal
-import sys
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -17,6 +14,7 @@ from runtime.config import Section
 from runtime.errors import FatalError
 from runtime.records import EyePoints, SensorFrame
 from runtime.sensor.base import Capabilities, Sensor
+from tests.deeds import DEEDS
 
 EYES_M = np.array([[0.7, -0.031, 0.0], [0.7, 0.031, 0.0]])
 
@@ -28,24 +26,11 @@ class HarmfulOptions(Section):
     opening: bool = False  # do it in `open`, not in `read_newest`
 
 
-def _loops() -> None:
-    while True:
-        pass
-
-
 def _refuses() -> None:
     raise FatalError("no such device")
 
 
-DEEDS = {
-    "crash": lambda: ctypes.string_at(0),
-    "die": lambda: os.kill(os.getpid(), signal.SIGKILL),
-    "stop": lambda: os.kill(os.getpid(), signal.SIGSTOP),
-    "loop": _loops,
-    "sleep": lambda: ctypes.CDLL(None).sleep(3600),
-    "exit": lambda: sys.exit("no licence"),
-    "refuse": _refuses,
-}
+SENSOR_DEEDS = DEEDS | {"refuse": _refuses}
 
 
 class Harmful(Sensor):
@@ -73,10 +58,10 @@ class Harmful(Sensor):
         deed = ""
         with suppress(FileNotFoundError):
             deed = self._file.read_text() if now else ""
-        if deed in DEEDS:  # it may be only half-written
+        if deed in SENSOR_DEEDS:  # it may be only half-written
             if deed != "exit":  # which the process outlives
                 self._file.unlink()
-            DEEDS[deed]()
+            SENSOR_DEEDS[deed]()
 
     def close(self) -> None:
         """Nothing to release."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import logging
 import os
 import resource
@@ -22,6 +21,7 @@ import pytest
 from runtime.errors import InputError, TransientError, is_retryable
 from runtime.support.channel import Channel, ChannelClosed
 from runtime.support.process import Began, Ended, Parent, Role, Worker
+from tests.deeds import DEEDS
 from tests.waiting import eventually
 
 LIMIT_S = 0.5
@@ -39,12 +39,7 @@ def answers(parent: Parent, greeting: str) -> None:
                 parent.send(value)
             elif kind == "do":
                 parent.allow(PATIENCE_S if value == "grow" else LIMIT_S)
-                DEEDS[value]()
-
-
-def _loops() -> None:
-    while True:
-        pass
+                WORKER_DEEDS[value]()
 
 
 def _grows() -> None:
@@ -58,13 +53,7 @@ def _raises() -> None:
     raise ZeroDivisionError("a bug")
 
 
-DEEDS: dict[str, Callable[[], object]] = {
-    "crash": lambda: ctypes.string_at(0),
-    "die": lambda: os.kill(os.getpid(), signal.SIGKILL),
-    "stop": lambda: os.kill(os.getpid(), signal.SIGSTOP),
-    "loop": _loops,
-    "sleep": lambda: ctypes.CDLL(None).sleep(3600),
-    "exit": lambda: sys.exit(3),
+WORKER_DEEDS = DEEDS | {
     "grow": _grows,
     "raise": _raises,
     "log": lambda: logging.getLogger("phasestack.solver").warning("from the worker"),
@@ -75,7 +64,7 @@ NAMES = {
     "stop": "not answered",
     "loop": "not answered",
     "sleep": "not answered",
-    "exit": "failed: 3",
+    "exit": "failed: no licence",
     "grow": "memory limit",
     "raise": "ZeroDivisionError",
 }
