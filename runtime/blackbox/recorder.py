@@ -31,7 +31,8 @@ import numpy as np
 
 from runtime.clock import NS_PER_MS, NS_PER_S
 from runtime.errors import InputError, Stopped, one_line, without_secrets
-from runtime.frame.presenter import Presenter, Refresh
+from runtime.frame.presenter import Presenter
+from runtime.frame.refresh import Refresh
 from runtime.frame.refresh_lines import line_of
 from runtime.records import F64, RefreshAccount, SensorFrame
 from runtime.sensor import recording_format as fmt
@@ -177,11 +178,12 @@ class Recorder(logging.Handler):
 
     def refreshed(self, refresh: Refresh) -> None:
         assert self._presenter is not None
-        account, machine = refresh.account, self._presenter.machine
-        at_ns, state = account.present_ns, (machine.name, machine.reason)
+        account, status = refresh.account, self._presenter.status
+        assert status is not None
+        at_ns, state = account.present_ns, (status.name, status.reason)
         if state != self._state or at_ns - self._state_ns >= STATE_EVERY_NS:
-            if machine.name != self._state[0]:
-                self._state_changed(machine.name, machine.reason, at_ns)
+            if status.name != self._state[0]:
+                self._state_changed(*state, at_ns)
             self._state, self._state_ns = state, at_ns
             self._keep(STATE, state_message(*state, monotonic_ns=at_ns))
         self._keep(REFRESH, refresh_message(account), account.frame)

@@ -15,6 +15,7 @@ import numpy as np
 from runtime.optics.stack import PanelStack
 from runtime.records import EyePoints, Eyes, PanelFrame, SensorFrame
 
+PAGES_MAX = 8  # maximum number of live pages, because pictures are sent to each of them
 SAMPLES_MAX = 256  # maximum number of samples waiting for the sensor
 CAPTURES_MAX = 512  # for how many captures the time on the page's clock is stored
 OVERLAY_PX = 320  # width of the camera pictures sent to pages
@@ -28,41 +29,87 @@ class SeenEyes:
     page_ms: float  # the sample's time on the page's clock
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, slots=True)
+class PageMode:
+    """What pages show, and how they serve as the sensor. Any change restarts the refresh loop."""
+
+    stack: PanelStack
+    fov_deg: float  # the target pictures' horizontal field of view
+    is_sensor: bool = True  # the viewer's page sends eye positions; otherwise they are measured with a camera
+    is_camera: bool = False  # the viewer's page sends camera pictures
+
+
+@dataclass(frozen=True, slots=True)
+class PageSensor:
+    """Properties of a page as a sensor, which any page may change at any time."""
+
+    noise_mm: float = 0.2  # simulated noise, standard deviation along each axis
+    latency_ms: float = 0.0  # simulated latency
+    camera_fov_deg: float = 65.0  # horizontal field of view; 65 degrees is typical of webcams
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """What the refresh loop last told all pages."""
+
+    frame: PanelFrame | None = None  # None before the first refresh of a loop
+    told: Mapping[str, Any] = field(default_factory=dict)  # status of the latest refresh
+    moment: Any = None  # layers and target pictures from the latest measured refresh
+
+
 class BrowserLink:
-    """Passes data between the refresh loop and all pages that show the display. Thread-safe. The page
-    that has been connected longest is the viewer: only its samples or camera pictures are used, and all other pages
-    just watch.
+    """Latest values that the refresh loop and all pages that show the display exchange. Each is replaced as a whole.
+    Thread-safe. The page that has been connected longest is the viewer: only its samples or camera pictures are used,
+    and all other pages just watch.
     """
 
-    stack: PanelStack  # the stack being shown
-    fov_deg: float  # the target pictures' horizontal field of view
-    is_sensor: bool = True  # True if the viewer's page sends eye positions, False if they are measured with a camera
-    noise_mm: float = 0.2  # simulated sensor noise, standard deviation along each axis
-    latency_ms: float = 0.0  # simulated sensor latency
-    is_camera: bool = False  # True if the viewer's page sends camera pictures
-    camera_fov_deg: float = 65.0  # the page camera's horizontal field of view; 65 degrees is typical of webcams
-    wishes: dict[str, float] = field(default_factory=dict)  # changes requested that need a restart: gap_mm, camera
-    moment: Any = None  # layers and target pictures from the latest measured refresh
-    found: Mapping[str, Any] | None = None  # latest camera picture and the pupils found in it
-    frame: PanelFrame | None = None  # latest frame presented on the panels
-    shown: tuple[PanelFrame | None, dict[str, Any]] = (None, {})  # frame and status of the latest refresh
-    news: dict[object, Callable[[], None]] = field(default_factory=dict)  # called when data changes, by page
-    _arrived: threading.Condition = field(default_factory=threading.Condition)
-    _picture: tuple[bytes, float] | None = None  # encoded camera picture and its time on the page's clock
-    _samples: deque[SeenEyes] = field(default_factory=lambda: deque(maxlen=SAMPLES_MAX))
-    _captures: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=CAPTURES_MAX))
+    def __init__(self, mode: PageMode) -> None:
+        self.mode = mode
+        self.sensor = PageSensor()
+        self.shown = Shown()
+        self.found: Mapping[str, Any] | None = None  # latest camera picture and the pupils found in it
+        self.wishes: Mapping[str, float] = {}  # changes requested that need a restart: gap_mm, camera
+        self._pages: dict[object, Callable[[], None]] = {}  # called when data changes
+        self._arrived = threading.Condition()
+        self._picture: tuple[bytes, float] | None = None  # encoded camera picture and its time on the page's clock
+        self._samples: deque[SeenEyes] = deque(maxlen=SAMPLES_MAX)
+        self._captures: deque[tuple[int, float]] = deque(maxlen=CAPTURES_MAX)
+
+    def join(self, page: object, notify: Callable[[], None]) -> bool:
+        """Connect a page, which is notified of changes on any thread. Returns False if too many are connected."""
+        if len(self._pages) >= PAGES_MAX:
+            return False
+        self._pages[page] = notify
+        return True
+
+    def leave(self, page: object) -> None:
+        """Disconnect a page. If it was the viewer's, the viewer or the camera is gone."""
+        was_viewer = self.is_viewer(page)
+        del self._pages[page]
+        if was_viewer and self.mode.is_sensor:
+            self.see(None, 0.0)
+        elif was_viewer and self.mode.is_camera:
+            self.wish("camera", 0.0)
 
     def is_viewer(self, page: object) -> bool:
         """Return True if `page` is the viewer's page, the one connected longest."""
-        return next(iter(self.news), None) is page
+        return next(iter(self._pages), None) is page
+
+    def wish(self, name: str, value: float) -> None:
+        """Ask for a change that restarts the refresh loop."""
+        self.wishes = {**self.wishes, name: value}
+
+    def begin_again(self, mode: PageMode) -> None:
+        """Forget all wishes and what was shown, because the refresh loop begins again."""
+        self.wishes, self.found, self.shown = {}, None, Shown(told=self.shown.told)
+        self.mode = mode
 
     def see(self, eyes_m: Any, page_ms: float) -> None:
         """Add eyes (2, 3) in `stack`, or None. Raises ValueError if they are not in front of the front panel."""
         eyes = None
         if eyes_m is not None:
             eyes = np.array(eyes_m, np.float64)
-            if eyes.shape != (2, 3) or not np.isfinite(eyes).all() or eyes[:, 0].min() <= self.stack.x_m[-1]:
+            if eyes.shape != (2, 3) or not np.isfinite(eyes).all() or eyes[:, 0].min() <= self.mode.stack.x_m[-1]:
                 raise ValueError("eyes: must be two points in metres that are in front of the front panel")
         with self._arrived:
             self._samples.append(SeenEyes(eyes, float(page_ms)))
@@ -104,13 +151,13 @@ class BrowserLink:
         """Return the page's time of the latest sample captured at or before `capture_ns`, or None."""
         return next((page_ms for ns, page_ms in reversed(tuple(self._captures)) if ns <= capture_ns), None)
 
-    def refreshed(self, account: dict[str, Any]) -> None:
-        """Publish the latest frame and its refresh's status to all pages."""
-        self.shown = self.frame, account
+    def show(self, frame: PanelFrame, told: Mapping[str, Any], *, moment: Any) -> None:
+        """Publish the latest frame, its refresh's status and the latest measured refresh to all pages."""
+        self.shown = Shown(frame, told, moment)
         self._notify()
 
     def _notify(self) -> None:
-        for notify in tuple(self.news.values()):
+        for notify in tuple(self._pages.values()):
             notify()
 
 

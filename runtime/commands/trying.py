@@ -11,13 +11,14 @@ import time
 import webbrowser
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import typer
 
-from runtime.browser.link import BrowserLink
+from runtime.browser.link import BrowserLink, PageMode
 from runtime.config import Settings, changed, load_settings, with_options
 from runtime.daemon.build import RunOptions
 from runtime.daemon.client import DaemonClient
@@ -52,7 +53,7 @@ def try_display(settings: Settings, *, port: int, opens: bool, seconds: float | 
     InputError if the port is in use, or for the settings.
     """
     is_sensor = settings.sensor.driver == "browser"
-    link = BrowserLink(settings.stack.stack(), settings.content.fov_deg, is_sensor=is_sensor)
+    link = BrowserLink(PageMode(settings.stack.stack(), settings.content.fov_deg, is_sensor=is_sensor))
     ends_s = float("inf") if seconds is None else time.monotonic() + seconds
 
     def until() -> str:
@@ -80,17 +81,16 @@ def _as_it_is(settings: Settings) -> Settings:
 
 
 def _as_wished(settings: Settings, link: BrowserLink) -> Settings:
-    """Return the settings with the page's gap and the current scene and model, and update the link's camera."""
-    wishes, link.wishes = link.wishes, {}
-    account = link.shown[1]
-    settings = with_options(settings, scene=account.get("scene"), model=account.get("model"))
+    """Return the settings with the page's gap and the current scene and model, and begin again with its camera."""
+    wishes, told, mode = link.wishes, link.shown.told, link.mode
+    settings = with_options(settings, scene=told.get("scene"), model=told.get("model"))
     if "gap_mm" in wishes:
         middle = (len(settings.stack.x_m) - 1) / 2
         x_m = tuple((n - middle) * wishes["gap_mm"] * 1e-3 for n in range(len(settings.stack.x_m)))
         settings = changed(settings, "stack", {"x_m": x_m}, source="try")
     if "camera" in wishes:
-        link.is_camera, link.is_sensor = bool(wishes["camera"]), not wishes["camera"]
-    link.found, link.stack = None, settings.stack.stack()
+        mode = replace(mode, is_camera=bool(wishes["camera"]), is_sensor=not wishes["camera"])
+    link.begin_again(replace(mode, stack=settings.stack.stack()))
     return settings
 
 

@@ -23,6 +23,7 @@ from runtime.errors import InputError, PanelLost, Stopped
 from runtime.eyes.calibration import load_calibration
 from runtime.eyes.detect import EyeFinder
 from runtime.frame.kept_light import Output
+from runtime.frame.messages import Facts, Live
 from runtime.frame.observer import RunObserver
 from runtime.frame.pacing import Pacer
 from runtime.frame.presenter import Presenter, Supervisor
@@ -34,7 +35,7 @@ from runtime.frame.viewer import Viewer
 from runtime.model.backends import Wanted
 from runtime.optics.stack import PanelStack
 from runtime.panels.base import PanelSink
-from runtime.panels.registry import BrowserPanels, open_panels
+from runtime.panels.registry import OffscreenPanels, open_panels
 from runtime.plan.savings import Saving, make_plan
 from runtime.records import Effort, RefreshAccount
 from runtime.sensor.browser import BrowserCamera, BrowserEyes
@@ -43,6 +44,7 @@ from runtime.sensor.registry import open_sensor
 from runtime.sensor.samples import RecordedSamples, Samples
 from runtime.support.background import before_all_others
 from runtime.support.gl import offscreen_context
+from runtime.support.process import usage
 from runtime.support.untrusted_input import MIB
 
 log = logging.getLogger("phasestack.build")
@@ -81,23 +83,28 @@ class Run:
     observer: RunObserver
     simulated: bool
 
-    def plan_items(self) -> list[dict[str, Any]]:
+    def plan_items(self, facts: Facts, live: Live) -> list[dict[str, Any]]:
         """Return the savings in use as dictionaries. Any time or cost that was not measured is None."""
-        facts, live = self.presenter.solver.facts, self.presenter.solver.live
         known = replace(live.measured, reuse=Saving(saves_ms=self.presenter.stats.reuse_saves_ms()))
         plan = make_plan(facts.info, facts.settings, seeing=live.seeing, measured=known)
         return [asdict(item) for item in plan.items]
 
+    def processes(self) -> list[dict[str, Any]]:
+        """Return what each of the run's processes uses, read now."""
+        own = {"role": "presenter", "restarts": 0, **usage(os.getpid())}
+        return [own, *self.presenter.solver.status(), *self.presenter.samples.status()]
+
     def summary(self) -> dict[str, Any]:
         """Return the contents of summary.json (docs/contracts.md)."""
+        solver = self.presenter.solver
         return {
             "clock": "simulated" if self.simulated else "real",
             "configured": list(SIMULATED_FIGURES) if self.simulated else [],  # figures that were not measured
             **self.presenter.summary(simulated=self.simulated),
             **self.observer.summary(),
-            "backend": self.presenter.solver.facts.backend,
-            "scene": self.presenter.solver.facts.info.name,
-            "plan": self.plan_items(),
+            "backend": solver.facts.backend,
+            "scene": solver.facts.info.name,
+            "plan": self.plan_items(solver.facts, solver.live),
         }
 
 
@@ -177,7 +184,7 @@ def build_run(
     panels: PanelSink = (
         _open_panels(settings, stack, clock, context, host)
         if options.browser is None
-        else BrowserPanels(options.browser, clock)
+        else OffscreenPanels(clock, name="browser")
     )
     cleanup.callback(panels.close)
     if simulated:
@@ -240,8 +247,8 @@ def start_sensor(settings: Settings, clock: Clock, link: BrowserLink | None = No
         return SensorProcess(SensorSetup(make_driver, settings.sensor, clock, make_finder))
     shown = partial(Reporting, make_finder)
     sensor: LiveSamples
-    if link.is_sensor or link.is_camera:
-        driver = BrowserEyes if link.is_sensor else BrowserCamera
+    if link.mode.is_sensor or link.mode.is_camera:
+        driver = BrowserEyes if link.mode.is_sensor else BrowserCamera
         sensor = SensorThread(SensorSetup(partial(driver, link, clock), settings.sensor, clock, shown))
     else:
         sensor = SensorProcess(SensorSetup(make_driver, settings.sensor, clock, shown))

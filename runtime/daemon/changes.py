@@ -186,7 +186,12 @@ class Changes:
             log.error("change refused: %s", problem)
             command.refuse(problem)
         else:
-            command.done(**status.holds(self._presenter))
+            command.done(**self.holds())
+
+    def holds(self) -> dict[str, Any]:
+        """Return the current scene, model, placement and pause, for a command's answer."""
+        presenter = self._presenter
+        return status.holds(presenter.solver.facts, paused=presenter.paused, flat_asked=presenter.flat_asked)
 
     def _load(self, loading: _Loading) -> None:
         self._loading, before = loading, self.choices

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from runtime.clock import Clock
@@ -61,7 +61,7 @@ class Notifier:
             self._settling = SETTLED_AFTER
             self._send(f"WATCHDOG_USEC={step_us}\nWATCHDOG=1")
 
-    def refreshed(self, state: State, missing: tuple[str, ...], *, presented: bool) -> None:
+    def refreshed(self, state: State, missing: Collection[str], *, presented: bool) -> None:
         """Feed the watchdog after a refresh, at most four times per period.
 
         A refresh counts if the panels showed it or if a panel is missing. It does not matter whether the solver is

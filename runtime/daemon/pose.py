@@ -13,7 +13,7 @@ import numpy as np
 from runtime.clock import NS_PER_S
 from runtime.config import PoseSettings
 from runtime.errors import InputError
-from runtime.frame.presenter import Refresh
+from runtime.frame.refresh import Refresh
 from runtime.records import F64, Eyes, SensorFrame
 from runtime.support.extras import missing_extra
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import time
 from base64 import b64encode
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,6 @@ from typing import Any
 import cv2
 import numpy as np
 
-from runtime.browser.link import BrowserLink
 from runtime.clock import NS_PER_MS
 from runtime.config import PLACING, ContentSettings, Settings
 from runtime.content.frames import PICTURES
@@ -21,13 +20,13 @@ from runtime.content.registry import MESHES, PLAYLISTS, SPLATS
 from runtime.content.scenes import SCENES
 from runtime.daemon.build import Run
 from runtime.evaluation.refresh_quality import view_error_mm
-from runtime.frame.presenter import Presenter, Refresh
+from runtime.frame.messages import Facts
+from runtime.frame.refresh import Refresh, Status
 from runtime.model.predictor import SHIPPED
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
 from runtime.records import U8, RefreshAccount
 from runtime.support.picture_header import VIDEOS
-from runtime.support.process import usage
 from runtime.support.version import version
 
 LIBRARY_MOST, LIBRARY_LOOKED_AT = 200, 2000  # limits: how many scenes are listed, how many folder entries are examined
@@ -39,81 +38,75 @@ def placing_in(settings: Settings) -> dict[str, Any]:
     return settings.content.model_dump(include=set(PLACING))
 
 
-def holds(presenter: Presenter) -> dict[str, Any]:
+def holds(facts: Facts, *, paused: bool, flat_asked: bool) -> dict[str, Any]:
     """Return the current scene, model, placement and pause, for inclusion in answers to commands."""
-    facts = presenter.solver.facts
     return {
         "scene": facts.settings.content.scene,
         "content": facts.info.name,
         "model": facts.model,
         "placing": placing_in(facts.settings),
-        "paused": presenter.paused,
-        "flat_asked": presenter.flat_asked,
+        "paused": paused,
+        "flat_asked": flat_asked,
     }
 
 
-def shown(presenter: Presenter, account: RefreshAccount, link: BrowserLink, run: Run | None) -> dict[str, Any]:
-    """Return the values from the latest refresh, for use by a page that displays the panels."""
-    assert presenter.last is not None
-    frame, solution = presenter.last.frame, presenter.last.solution
+def shown(status: Status, *, light: Mapping[str, Any], page_ms: float | None) -> dict[str, Any]:
+    """Return what a page that displays the panels needs to know of the latest refresh, whose newest sample was
+    captured at `page_ms` on the page's clock.
+    """
+    account, frame, solution = status.refresh.account, status.refresh.frame, status.refresh.solution
     return {
         "frame": account.frame,
-        "state": presenter.machine.name,
-        "reason": presenter.machine.reason,
+        "state": status.name,
+        "reason": status.reason,
         "eyes_m": account.eyes_m,
         "eyes_label": account.eyes_label,
         "eye_sigma_mm": account.eye_sigma_mm,
         "flatness": 1.0 if frame.solved is None else frame.flatness,
         "solved_for_m": None if solution is None or solution.solved_for_m is None else solution.solved_for_m[:2],
-        "scene": presenter.state.settings.content.scene,
-        "model": presenter.state.settings.model.name,
-        "page_ms": link.page_ms_of(account.capture_ns),
-        **({} if run is None else run.observer.light(presenter.last)),
+        "scene": status.settings.content.scene,
+        "model": status.settings.model.name,
+        "page_ms": page_ms,
+        **light,
     }
 
 
-def snapshot(run: Run, account: RefreshAccount) -> dict[str, Any]:
-    """Return the answer to a `status` request after a given refresh."""
-    presenter = run.presenter
-    machine, stats = presenter.machine, presenter.stats
-    facts, live = presenter.solver.facts, presenter.solver.live
+def snapshot(status: Status, run: Run) -> dict[str, Any]:
+    """Return the answer to a `status` request: a refresh's status and the figures that `run` has collected so far."""
+    account, facts, live = status.refresh.account, status.facts, status.live
     return {
-        "state": machine.name,
-        "reason": machine.reason,
-        "missing": presenter.missing,
-        **holds(presenter),
+        "state": status.name,
+        "reason": status.reason,
+        "missing": status.missing,
+        **holds(facts, paused=status.paused, flat_asked=status.flat_asked),
         "content_problem": live.problem,
         "content_left_out": facts.info.left_out,
         "program": live.program,
         "playlist": live.playlist,
-        "plan": run.plan_items(),
+        "plan": run.plan_items(facts, live),
         "model_asked": facts.settings.model.name,
         "provider": facts.provider,
         "backend": facts.backend,
         "backend_why": facts.backend_why,
-        "panels": presenter.panels.name,
-        "processes": [
-            {"role": "presenter", "restarts": 0, **usage(os.getpid())},
-            *presenter.solver.status(),
-            *presenter.samples.status(),
-        ],
+        "panels": run.presenter.panels.name,
+        "processes": run.processes(),
         "eyes_m": account.eyes_m,
         "people": people_served(account),
-        "people_in_view": presenter.viewer.in_view,
+        "people_in_view": status.people_in_view,
         "eyes_label": account.eyes_label,
         "eye_sigma_now_mm": account.eye_sigma_mm,
         "solution": account.solution,
         # A solution computed for a time after this display time has no age yet.
         "solution_age_now_ms": None if account.solution_age_ms is None else max(0.0, account.solution_age_ms),
         "effort": account.effort,
-        **run.observer.light(presenter.last),
+        **run.observer.light(status.refresh),
         **run.observer.live(),
         "view_error_estimated_now_mm": _view_error_now_mm(account),
         "photon_now_ms": (account.photon_ns - account.capture_ns) / NS_PER_MS if account.capture_ns else None,
-        "rejected_samples": dict(presenter.viewer.refused),
-        "sensor_hz": presenter.viewer.rate_hz if "sensor" not in presenter.missing else None,
-        **stats.rates_now(),
-        **stats.summary(stale_inputs=presenter.samples.stale_inputs),
+        "rejected_samples": status.rejected_samples,
+        "sensor_hz": status.sensor_hz,
+        **run.presenter.stats.rates_now(),
+        **run.presenter.stats.summary(stale_inputs=status.stale_inputs),
     }
 
 
@@ -138,9 +131,8 @@ def _view_error_now_mm(account: RefreshAccount) -> float | None:
     return round(view_error_mm(account.eyes_m, account.solved_for_m), 2)
 
 
-def about(run: Run) -> dict[str, Any]:
+def about(settings: Settings, stack: PanelStack) -> dict[str, Any]:
     """Return a run's constant facts and the models and scenes that can be chosen, for use by the page."""
-    settings, stack = run.presenter.state.settings, run.presenter.stack
     return {
         "version": version(),
         "stack": {"width_m": stack.width_m, "height_m": stack.height_m, "x_m": stack.x_m},
@@ -167,17 +159,15 @@ def library_scenes(settings: ContentSettings) -> tuple[str, ...]:
     return tuple(scenes[:LIBRARY_MOST])
 
 
-def pictures(run: Run) -> dict[str, Any]:
+def pictures(status: Status | None, stack: PanelStack) -> dict[str, Any]:
     """Return base64-encoded JPEG thumbnails of the latest refresh, with its time and state."""
-    refresh, state = run.presenter.last, run.presenter.machine.name
-    if refresh is None:
+    if status is None:
         return {"frame": None, "jpegs": {}}
-    fov_deg = run.presenter.state.settings.content.fov_deg
-    jpegs = pictures_of(refresh, run.presenter.stack, fov_deg=fov_deg)
+    jpegs = pictures_of(status.refresh, stack, fov_deg=status.settings.content.fov_deg)
     return {
-        "frame": refresh.account.frame,
+        "frame": status.refresh.account.frame,
         "time_s": time.time(),
-        "state": state,
+        "state": status.name,
         "jpegs": {name: b64encode(jpeg).decode() for name, jpeg in jpegs.items()},
     }
 

@@ -13,7 +13,7 @@ from typing import Any
 from runtime.blackbox.recorder import ASKED, Recorder
 from runtime.clock import MonotonicClock
 from runtime.config import Settings
-from runtime.daemon import status
+from runtime.daemon import status as answers
 from runtime.daemon.build import Host, Run, RunOptions
 from runtime.daemon.changes import Changes
 from runtime.daemon.commands import Command
@@ -23,7 +23,8 @@ from runtime.daemon.server import StatusServer, open_status_server
 from runtime.daemon.signals import Signals
 from runtime.errors import FatalError, PanelLost, Stopped, retry_advised
 from runtime.frame.presenter import Presenter
-from runtime.records import RefreshAccount, State
+from runtime.frame.refresh import Status
+from runtime.records import State
 from runtime.support import logs
 from runtime.support.folders import state_folder
 from runtime.support.memory import keep_freed_memory
@@ -36,7 +37,7 @@ PANEL_RETRY_S = 1.0  # interval between attempts to find a missing panel
 class Daemon(Host):
     """Handles signals and commands, and publishes the status, between refreshes. All methods must be
     called on the presenter's thread. The status server's thread calls only the latest published snapshot and the
-    functions in the server's `lookups`, and these read only frozen values and thread-safe counters.
+    functions in the server's `lookups`, and these read only a frozen `Status` and thread-safe counters.
     """
 
     def __init__(
@@ -76,23 +77,29 @@ class Daemon(Host):
                 changes.attempt(command, partial(self._carry_out, presenter, changes, command))
         changes.carry_on()
 
-    def refreshed(self, presenter: Presenter, account: RefreshAccount) -> None:
-        machine = presenter.machine
+    def refreshed(self, status: Status) -> None:
+        account, run, changes = status.refresh.account, self.run, self.changes
+        assert run is not None and changes is not None
         if account.presented:
             self._notifier.ready()
-        self._notifier.status(f"{machine.name} ({machine.reason})")
-        self._notifier.refreshed(machine.state, machine.missing, presented=account.presented)
-        if self._server is not None and (run := self.run) is not None and (changes := self.changes) is not None:
+        self._notifier.status(f"{status.name} ({status.reason})")
+        self._notifier.refreshed(account.state, status.missing, presented=account.presented)
+        if self._server is not None:
             loading, refused, recorder = changes.loading, changes.refused, self.recorder
-            self._server.publish(lambda: status.snapshot(run, account) | _news(loading, refused, recorder))
+            self._server.publish(lambda: answers.snapshot(status, run) | _news(loading, refused, recorder))
         if self._link is not None:
-            self._link.moment = self.run.observer.moment if self.run is not None else None
-            self._link.refreshed(status.shown(presenter, account, self._link, self.run))
+            page_ms = self._link.page_ms_of(account.capture_ns)
+            told = answers.shown(status, light=run.observer.light(status.refresh), page_ms=page_ms)
+            self._link.show(status.refresh.frame, told, moment=run.observer.moment)
 
     def watches(self, run: Run) -> None:
         self.run, self.changes = run, Changes(run.presenter)
         if self._server is not None:
-            self._server.lookups |= {"about": lambda: status.about(run), "pictures": lambda: status.pictures(run)}
+            presenter = run.presenter
+            self._server.lookups |= {
+                "about": lambda: answers.about(presenter.state.settings, presenter.stack),
+                "pictures": lambda: answers.pictures(presenter.status, presenter.stack),
+            }
             self._server.lookups |= {"log": self.recorder.look_at_log} if self.recorder is not None else {}
 
     def wait_for_panel(self, why: str) -> bool:
@@ -121,13 +128,13 @@ class Daemon(Host):
         match command.name:
             case "pause":
                 presenter.paused = True
-                command.done(**status.holds(presenter))
+                command.done(**changes.holds())
             case "flat":
                 presenter.flat_asked = True
-                command.done(**status.holds(presenter))
+                command.done(**changes.holds())
             case "resume":
                 presenter.paused = presenter.flat_asked = False
-                command.done(**status.holds(presenter))
+                command.done(**changes.holds())
             case "reload":
                 read = self._read_settings
                 changes.begin(command, lambda choices: choices.reloaded(read))

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from runtime.evaluation.refresh_quality import Pictures, RefreshTargets, solved_eyes_of, true_eyes_of
-from runtime.frame.presenter import Refresh
+from runtime.frame.refresh import Refresh
 from runtime.frame.targets import TargetDrawer
 from runtime.frame.truth import TrueEyes
 from runtime.optics.presentation import shown_layers

@@ -8,7 +8,7 @@ from typing import Any
 from runtime.clock import NS_PER_S
 from runtime.evaluation.contact_sheet import Moment
 from runtime.frame.kept_light import KeptLight, Output
-from runtime.frame.presenter import Refresh
+from runtime.frame.refresh import Refresh
 from runtime.frame.refresh_lines import RefreshLines
 from runtime.frame.sampling import QualitySampler, has_picture
 from runtime.frame.targets import TargetDrawer

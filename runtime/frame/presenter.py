@@ -9,14 +9,13 @@ The solver (`solver_host`) runs in parallel and delivers complete solutions.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from time import perf_counter_ns
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
 
-from runtime.clock import NS_PER_MS, Clock, SimulatedClock, Stopwatch
+from runtime.clock import NS_PER_MS, Clock
 from runtime.config import Settings
 from runtime.errors import EndOfRecording, PanelLost
 from runtime.eyes.calibration import Calibration
@@ -24,6 +23,7 @@ from runtime.frame.aim import Aim
 from runtime.frame.messages import SolverUpdate
 from runtime.frame.pacing import Pacer
 from runtime.frame.policy import Flatness, wants_flat
+from runtime.frame.refresh import Refresh, RefreshTimes, Status
 from runtime.frame.run_state import RunState
 from runtime.frame.served import accounts_of, matched
 from runtime.frame.solver_host import SolverHost
@@ -60,18 +60,8 @@ class Supervisor:
     def carry_out_commands(self, presenter: Presenter) -> None:
         """Carry out all operator commands received since the last refresh."""
 
-    def refreshed(self, presenter: Presenter, account: RefreshAccount) -> None:
-        """Handle a completed refresh's account."""
-
-
-@dataclass(frozen=True, slots=True)
-class Refresh:
-    """A refresh's data, as passed to observers."""
-
-    account: RefreshAccount
-    frame: PanelFrame
-    solution: Solution | None  # the latest solution at the time of this refresh
-    state_version: int = 0  # the solver's state at this refresh (`Facts.version`)
+    def refreshed(self, status: Status) -> None:
+        """Handle a completed refresh's status."""
 
 
 class Observer(Protocol):
@@ -82,42 +72,6 @@ class Observer(Protocol):
 
     def refreshed(self, refresh: Refresh) -> None:
         """Handle a completed refresh."""
-
-
-class RefreshTimes:
-    """Measures each stage of a refresh, or advances a simulated clock by the configured time."""
-
-    def __init__(self, clock: Clock, simulated_ms: Mapping[str, float]) -> None:
-        self._simulated = clock if isinstance(clock, SimulatedClock) else None
-        self._simulated_ms = simulated_ms
-        self.stage_ms: dict[str, float] = {}
-        self._watch, self._start_ns = Stopwatch(), perf_counter_ns()
-
-    @property
-    def simulated(self) -> bool:
-        """True if time advances only by configured durations."""
-        return self._simulated is not None
-
-    def lap(self, stage: str) -> None:
-        """Record the time since the last lap as the time taken by `stage`."""
-        self._watch.lap(stage)
-        if self._simulated is None:
-            self.stage_ms[stage] = self._watch.stage_ms[stage]
-        elif stage not in self.stage_ms:
-            cost_ms = self._simulated_ms.get(stage, 0.0)
-            if stage != "wait":  # while waiting, the simulated clock has advanced anyway
-                self._simulated.advance_ns(round(cost_ms * NS_PER_MS))
-            self.stage_ms[stage] = cost_ms
-
-    def hold(self, held_ns: int) -> None:
-        """Count a part of the stage `present` as `wait`, because the drawn frame was held back."""
-        self.stage_ms["present"] -= held_ns / NS_PER_MS
-        self.stage_ms["wait"] = self.stage_ms.get("wait", 0.0) + held_ns / NS_PER_MS
-
-    def overhead_ms(self) -> float:
-        """Return the refresh's time on the machine's clock in ms, without presenting and waiting."""
-        whole_ms = (perf_counter_ns() - self._start_ns) / NS_PER_MS
-        return max(0.0, whole_ms - sum(self._watch.stage_ms.get(stage, 0.0) for stage in ("present", "wait")))
 
 
 class Presenter:
@@ -154,7 +108,7 @@ class Presenter:
         self.flat_asked = False
         self.paused = False
         self.missing: dict[str, str] = {}  # reason for each failed part
-        self.last: Refresh | None = None
+        self.status: Status | None = None  # published once per refresh; all other threads read only this
         self._flatness = Flatness()
         self._presented = False
         self._shown_solution: int | None = None  # number of the solution shown at the previous refresh
@@ -284,7 +238,8 @@ class Presenter:
         """
         if frame.solved is None and frame.flat is None:
             return None, ""
-        unchanged = self.last is not None and self.last.account.presented and _same(frame, self.last.frame)
+        last = self.last
+        unchanged = last is not None and last.account.presented and _same(frame, last.frame)
         try:
             report = self.panels.present(frame, unchanged=unchanged, due_ns=due_ns)
         except PanelLost as error:
@@ -373,11 +328,35 @@ class Presenter:
     def _report(
         self, account: RefreshAccount, frame: PanelFrame, solution: Solution | None, times: RefreshTimes
     ) -> None:
-        self.last = Refresh(account, frame, solution, self.solver.facts.version)
-        self._supervisor.refreshed(self, account)
+        refresh = Refresh(account, frame, solution, self.solver.facts.version)
+        self.status = self._status(refresh)
+        self._supervisor.refreshed(self.status)
         self.stats.add(account, overhead_ms=times.overhead_ms(), missed_blanks=self.pacer.missed)
         for observer in self._observers:
-            observer.refreshed(self.last)
+            observer.refreshed(refresh)
+
+    def _status(self, refresh: Refresh) -> Status:
+        viewer = self.viewer
+        return Status(
+            refresh=refresh,
+            name=self.machine.name,
+            reason=self.machine.reason,
+            missing=self.missing,
+            paused=self.paused,
+            flat_asked=self.flat_asked,
+            settings=self.state.settings,
+            facts=self.solver.facts,
+            live=self.solver.live,
+            people_in_view=viewer.in_view,
+            rejected_samples=dict(viewer.refused),
+            sensor_hz=None if "sensor" in self.missing else viewer.rate_hz,
+            stale_inputs=self.samples.stale_inputs,
+        )
+
+    @property
+    def last(self) -> Refresh | None:
+        """The latest refresh, or None before the first."""
+        return None if self.status is None else self.status.refresh
 
     def summary(self, *, simulated: bool = False) -> dict[str, Any]:
         """Return the counts, times, model and states for summary.json (docs/contracts.md)."""

@@ -27,7 +27,7 @@ from runtime.evaluation.refresh_quality import (
     solved_eyes_of,
     true_eyes_of,
 )
-from runtime.frame.presenter import Refresh
+from runtime.frame.refresh import Refresh
 from runtime.frame.targets import TargetDrawer
 from runtime.frame.truth import TrueEyes
 from runtime.optics.presentation import shown_layers

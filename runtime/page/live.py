@@ -6,45 +6,40 @@ import asyncio
 import contextlib
 import json
 import math
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import cv2
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from runtime.browser.link import BrowserLink
+from runtime.browser.link import BrowserLink, PageMode
 from runtime.browser.still import half_floats, stack_table
 from runtime.optics.carried import intensities
 from runtime.optics.retina import as_codes
 from runtime.records import F32, U8
 from runtime.support.artifacts import to_json
 
-PAGES_MAX = 8  # maximum number of live pages, because pictures are sent to each of them
 RANGES = {"noise_mm": (0.0, 50.0), "latency_ms": (0.0, 1000.0), "camera_fov_deg": (20.0, 150.0)}
 RANGES |= {"gap_mm": (1.0, 500.0), "camera": (0.0, 1.0)}  # changing either of these restarts the refresh loop
 
 
 async def live(socket: WebSocket, link: BrowserLink, *, protocol: str | None) -> None:
     """Serve an authorised page on a socket not accepted yet, with its subprotocol, until it leaves."""
-    if len(link.news) >= PAGES_MAX:
+    page, me = _Page(socket, link), object()
+    loop = asyncio.get_running_loop()
+    if not link.join(me, lambda: _tell(loop, page.news)):
         await socket.close(1013, "too many pages are open")
         return
-    await socket.accept(protocol)
-    page = _Page(socket, link)
-    loop, me = asyncio.get_running_loop(), object()
-    link.news[me] = lambda: _tell(loop, page.news)
     try:
+        await socket.accept(protocol)
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(page.send(me))
             tasks.create_task(page.receive(me))
     except* (WebSocketDisconnect, RuntimeError, OSError):
         pass
     finally:
-        was_viewer = link.is_viewer(me)
-        del link.news[me]
-        if was_viewer and link.is_sensor:
-            link.see(None, 0.0)
-        elif was_viewer and link.is_camera:
-            link.wishes["camera"] = 0.0
+        link.leave(me)
 
 
 def _tell(loop: asyncio.AbstractEventLoop, news: asyncio.Event) -> None:
@@ -59,20 +54,21 @@ class _Page:
         self._socket, self._link = socket, link
         self.news, self._sent = asyncio.Event(), {"solved": 0, "flat": 0}
         self._under_way = False  # True while the page has not drawn the latest layers
-        self._stack: Any = None
+        self._mode: PageMode | None = None
         self._checks, self._moment = False, None  # _checks: send the latest measured refresh, not the live one
 
     async def send(self, me: object) -> None:
-        sent: dict[str, Any] = {}
-        found: Any = None
+        told: Mapping[str, Any] | None = None
+        found: Mapping[str, Any] | None = None
         while True:
-            link, (frame, account) = self._link, self._link.shown
-            if self._stack is not link.stack:
-                self._stack, self._sent = link.stack, {"solved": 0, "flat": 0}
-                fields = {"fov_deg": link.fov_deg, "is_sensor": link.is_sensor, "is_camera": link.is_camera}
-                await self._say({"stack": stack_table(link.stack), **fields})
-            if self._checks and link.moment is not None and link.moment is not self._moment and not self._under_way:
-                await self._send_moment(link.moment)
+            link, mode, shown = self._link, self._link.mode, self._link.shown
+            if self._mode is not mode:
+                self._mode, self._sent = mode, {"solved": 0, "flat": 0}
+                fields = {"fov_deg": mode.fov_deg, "is_sensor": mode.is_sensor, "is_camera": mode.is_camera}
+                await self._say({"stack": stack_table(mode.stack), **fields})
+            frame, moment = shown.frame, shown.moment
+            if self._checks and moment is not None and moment is not self._moment and not self._under_way:
+                await self._send_moment(moment)
             if frame is not None and not self._under_way and not self._checks:
                 for kind, layers, version, relief in (
                     ("flat", frame.flat, frame.flat_version, None),
@@ -80,10 +76,10 @@ class _Page:
                 ):
                     if layers is not None and version != self._sent[kind] and not self._under_way:
                         self._sent[kind], self._under_way = version, True
-                        await self._send_layers(kind, layers, relief, account.get("solved_for_m"))
-            if account is not sent:
-                sent = account
-                await self._say({"refresh": sent, "viewer": link.is_viewer(me)})
+                        await self._send_layers(kind, layers, relief, shown.told.get("solved_for_m"))
+            if shown.told is not told:
+                told = shown.told
+                await self._say({"refresh": told, "viewer": link.is_viewer(me)})
             if link.found is not found and link.found is not None:
                 found = link.found
                 await self._say({"found": found})
@@ -120,7 +116,7 @@ class _Page:
             if given["type"] == "websocket.disconnect":
                 raise WebSocketDisconnect(given.get("code", 1000))
             if given.get("bytes") is not None:
-                if self._link.is_viewer(me) and self._link.is_camera:
+                if self._link.is_viewer(me) and self._link.mode.is_camera:
                     self._link.send_picture(given["bytes"], picture_ms)
                 continue
             message = json.loads(given["text"])
@@ -133,7 +129,7 @@ class _Page:
             if message.get("drawn"):
                 self._under_way = False
                 self.news.set()
-            if "eyes" in message and self._link.is_viewer(me) and self._link.is_sensor:
+            if "eyes" in message and self._link.is_viewer(me) and self._link.mode.is_sensor:
                 with contextlib.suppress(ValueError, TypeError):
                     self._link.see(message["eyes"], float(message.get("page_ms", 0.0)))
             for name, (least, most) in RANGES.items():
@@ -143,9 +139,9 @@ class _Page:
                 if not least <= value <= most:
                     continue
                 if name in ("gap_mm", "camera"):
-                    self._link.wishes[name] = value
+                    self._link.wish(name, value)
                 else:
-                    setattr(self._link, name, value)
+                    self._link.sensor = replace(self._link.sensor, **{name: value})
 
     async def _say(self, message: dict[str, Any]) -> None:
         await self._socket.send_text(to_json(message))

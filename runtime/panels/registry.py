@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from runtime.browser.link import BrowserLink
 from runtime.clock import Clock
 from runtime.config import OutputSettings, PanelSettings
 from runtime.optics.stack import PanelStack
@@ -16,34 +15,16 @@ if TYPE_CHECKING:
 
 
 class OffscreenPanels(PanelSink):
-    """Output with no screen, which accepts frames but does not draw them."""
+    """Output with no screen, which accepts frames but does not draw them. A web page, for example, draws them."""
 
-    name = "offscreen"
-
-    def __init__(self, clock: Clock) -> None:
-        self._clock = clock
+    def __init__(self, clock: Clock, *, name: str = "offscreen") -> None:
+        self._clock, self.name = clock, name
 
     def present(self, frame: PanelFrame, *, unchanged: bool = False, due_ns: int | None = None) -> PresentReport:
         return PresentReport(frame.number, self._clock.now_ns(), 0.0)
 
     def close(self) -> None:
         """Do nothing, because no windows or contexts are open."""
-
-
-class BrowserPanels(PanelSink):
-    """Output to a web page, which aligns and draws the latest frame at its own rate."""
-
-    name = "browser"
-
-    def __init__(self, link: BrowserLink, clock: Clock) -> None:
-        self._link, self._clock = link, clock
-
-    def present(self, frame: PanelFrame, *, unchanged: bool = False, due_ns: int | None = None) -> PresentReport:
-        self._link.frame = frame
-        return PresentReport(frame.number, self._clock.now_ns(), 0.0)
-
-    def close(self) -> None:
-        self._link.frame = None
 
 
 def panel_settings(settings: OutputSettings, count: int) -> tuple[PanelSettings, ...]:

@@ -74,10 +74,10 @@ class BrowserEyes(Sensor):
         self._count += 1
         points, eyes_m = None, self._last.eyes_m
         if eyes_m is not None:
-            sigma_m = max(self._link.noise_mm * 1e-3, LEAST_SIGMA_M)
-            noise_m = self._random.normal(size=3) * self._link.noise_mm * 1e-3
+            sigma_m = max(self._link.sensor.noise_mm * 1e-3, LEAST_SIGMA_M)
+            noise_m = self._random.normal(size=3) * self._link.sensor.noise_mm * 1e-3
             points = EyePoints(eyes_m + noise_m, np.ones(2), covariance_m2=np.eye(3) * sigma_m**2)
-        due_ns = now_ns + round(self._link.latency_ms * NS_PER_MS)
+        due_ns = now_ns + round(self._link.sensor.latency_ms * NS_PER_MS)
         self._waiting.append((due_ns, SensorFrame(self._count, capture_ns, points, true_eyes_m=eyes_m)))
 
     def close(self) -> None:
@@ -108,7 +108,7 @@ class BrowserCamera(Sensor):
         self._number += 1
         self._captured_ns = max(capture_ns, self._captured_ns + 1)
         height, width = picture.shape[:2]
-        intrinsics = Intrinsics.centred(width, height, fov_rad=radians(self._link.camera_fov_deg))
+        intrinsics = Intrinsics.centred(width, height, fov_rad=radians(self._link.sensor.camera_fov_deg))
         colour = np.ascontiguousarray(picture[..., ::-1])
         return SensorFrame(self._number, self._captured_ns, colour=colour, intrinsics=intrinsics)
 

@@ -17,7 +17,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from runtime.browser.link import BrowserLink
+from runtime.browser.link import BrowserLink, PageMode
 from runtime.clock import MonotonicClock
 from runtime.config import StackGeometry
 from runtime.content.scenes import SCENES
@@ -174,7 +174,7 @@ def test_without_the_token_there_is_nothing(url: str, headers: dict) -> None:
 
 
 def test_a_resting_head_is_sampled_on_and_captures_only_go_forward() -> None:
-    link = BrowserLink(StackGeometry().stack(), 40.0)
+    link = BrowserLink(PageMode(StackGeometry().stack(), 40.0))
     samples: list[Any] = []
     with BrowserEyes(link, MonotonicClock()) as sensor:
         for page_ms in (1000.0, 1001.0):  # the second one was long under way

@@ -15,6 +15,7 @@ from runtime.clock import MonotonicClock
 from runtime.daemon.build import Host
 from runtime.daemon.notify import Notifier
 from runtime.errors import ContentFailure, ModelFailure, SensorLost
+from runtime.frame.refresh import Status
 from runtime.model.session import ModelSession
 from runtime.records import RefreshAccount
 from tests.daemon.rig import TRACKING, Rig
@@ -127,8 +128,9 @@ class Watched(Host):
     def __init__(self, notifier: Notifier) -> None:
         self.notifier = notifier
 
-    def refreshed(self, presenter: Any, account: RefreshAccount) -> None:
-        self.notifier.refreshed(presenter.machine.state, presenter.machine.missing, presented=account.presented)
+    def refreshed(self, status: Status) -> None:
+        account = status.refresh.account
+        self.notifier.refreshed(account.state, status.missing, presented=account.presented)
 
 
 WATCHDOG_S = 0.4

@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 
-from runtime.daemon import status
 from tests.daemon.rig import TRACKING, Rig
 
 
@@ -39,7 +38,7 @@ def test_whatever_ends_the_sensor_all_refreshes_are_presented(rig: Rig, how: int
     assert reason in rig.presenter.machine.reason
     rig.refresh_until(TRACKING)
     assert all(account.presented for account in rig.accounts[first:]) and rig.presenter.stats.dropped == 0
-    processes = {process["role"]: process for process in status.snapshot(rig.run, rig.accounts[-1])["processes"]}
+    processes = {process["role"]: process for process in rig.run.processes()}
     assert processes["sensor"]["restarts"] == before["restarts"] + 1
     assert processes["sensor"]["pid"] not in (before["pid"], None)
     assert processes["sensor"]["memory_mib"] > 5 and processes["sensor"]["cpu_s"] >= 0

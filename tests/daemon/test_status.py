@@ -18,8 +18,7 @@ from tests.daemon.rig import Rig
 
 def told_by(rig: Rig) -> tuple[dict, str]:
     """The snapshot as it comes through the socket, and as a person reads it."""
-    account = rig.presenter.last.account
-    answer = json.loads(to_json({"ok": True, "pid": 1, "uptime_s": 1.0, **snapshot(rig.run, account)}))
+    answer = json.loads(to_json({"ok": True, "pid": 1, "uptime_s": 1.0, **snapshot(rig.presenter.status, rig.run)}))
     return answer, "\n".join(lines_of(answer))
 
 

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from runtime.config import Settings
 from runtime.daemon.status import about
 from tests.daemon.test_changes import Served
 from tests.test_cli import refusal
@@ -84,10 +85,11 @@ def test_the_library_is_offered_with_the_scenes(tmp_path: Path) -> None:
         (library / name).touch()
     (library / "lego").mkdir()
     (library / os.fsdecode(b"\xff.glb")).touch()  # no setting can hold such a name
-    with Served(tmp_path, content={"library": str(library)}) as served:
-        offered = [Path(name).name for name in about(served.run)["scenes"] if name.startswith(str(library))]
-        assert offered == ["a.ply", "b.glb", "film_sbs.mp4", "lego", "list.toml"]
-        assert about(served.run)["models"][:2] == ("fast", "balanced")
+    settings = Settings.model_validate({"content": {"library": str(library)}})
+    told = about(settings, settings.stack.stack())
+    offered = [Path(name).name for name in told["scenes"] if name.startswith(str(library))]
+    assert offered == ["a.ply", "b.glb", "film_sbs.mp4", "lego", "list.toml"]
+    assert told["models"][:2] == ("fast", "balanced")
 
 
 def test_the_page_gets_small_pictures_of_layers_and_eye_views(tmp_path: Path) -> None:

@@ -15,7 +15,8 @@ from runtime.eyes.calibration import load_calibration
 from runtime.frame.effort import Costs, simulated_costs
 from runtime.frame.messages import Answer, Facts, Live, Order, SolverUpdate
 from runtime.frame.pacing import Pacer
-from runtime.frame.presenter import Presenter, Refresh
+from runtime.frame.presenter import Presenter
+from runtime.frame.refresh import Refresh
 from runtime.frame.run_state import RunState
 from runtime.frame.solver_host import SolverHost
 from runtime.frame.viewer import Viewer

@@ -18,7 +18,7 @@ from runtime.evaluation.displayed import displayed
 from runtime.frame import refresh_lines, sampling
 from runtime.frame.messages import Draw, Facts, Order
 from runtime.frame.observer import RunObserver
-from runtime.frame.presenter import Refresh
+from runtime.frame.refresh import Refresh
 from runtime.frame.targets import TargetDrawer, drawn
 from runtime.model.predictor import Predictor
 from runtime.optics.alignment import align

@@ -15,7 +15,8 @@ from runtime.clock import Clock
 from runtime.config import OutputSettings, Settings
 from runtime.daemon.build import Host, Run, RunOptions
 from runtime.daemon.drive import drive
-from runtime.frame.presenter import Presenter, Refresh
+from runtime.frame.presenter import Presenter
+from runtime.frame.refresh import Refresh
 from runtime.optics.presentation import scale_and_shift, shown_layers
 from runtime.optics.stack import PanelStack
 from runtime.panels.registry import panel_settings

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from runtime.browser.link import BrowserLink
+from runtime.browser.link import BrowserLink, PageMode
 from runtime.clock import SimulatedClock
 from runtime.errors import SensorTimeout
 from runtime.optics.stack import PanelStack
@@ -16,7 +16,7 @@ from runtime.sensor.browser import PICTURE_MAX_PX, BrowserCamera
 
 
 def sent(coded: bytes) -> BrowserCamera:
-    link = BrowserLink(PanelStack(0.5, 0.3, (-0.06, 0.0, 0.06), 32, 18), fov_deg=40.0)
+    link = BrowserLink(PageMode(PanelStack(0.5, 0.3, (-0.06, 0.0, 0.06), 32, 18), fov_deg=40.0))
     link.send_picture(coded, 5.0)
     camera = BrowserCamera(link, SimulatedClock())
     camera.open()
