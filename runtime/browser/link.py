@@ -31,7 +31,7 @@ class SeenEyes:
 
 @dataclass(frozen=True, slots=True)
 class PageMode:
-    """What pages show, and how they serve as the sensor. Any change restarts the refresh loop."""
+    """Display that pages show, and how they serve as the sensor. Any change restarts the refresh loop."""
 
     stack: PanelStack
     fov_deg: float  # the target pictures' horizontal field of view
@@ -50,7 +50,7 @@ class PageSensor:
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """What the refresh loop last told all pages."""
+    """Latest state of the refresh loop, as published to all pages."""
 
     frame: PanelFrame | None = None  # None before the first refresh of a loop
     told: Mapping[str, Any] = field(default_factory=dict)  # status of the latest refresh

@@ -1,4 +1,4 @@
-"""What is known of one refresh: its data, its times, and the status of the run as of this refresh."""
+"""Records of one refresh: its data, its times, and the run's status."""
 
 from __future__ import annotations
 
