@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from calib.capture import Walk
 from calib.commands import app
@@ -26,10 +25,10 @@ from runtime.eyes.calibration import demo_stack_from_sensor
 from runtime.records import EyePoints, SensorFrame
 from runtime.sensor.recording import recording_to
 from runtime.sensor.recording_format import RecordingHeader
+from tests.calls import answered
 from tests.waiting import eventually
 
 STEP_NS = NS_PER_S // 30
-run = CliRunner()
 
 
 def eyes_at(stack_m: np.ndarray, *, noise_m: float = 0.0, random: np.random.Generator | None = None) -> EyePoints:
@@ -78,10 +77,8 @@ def recording(path: Path, places: list[np.ndarray], *, true: bool) -> Path:
 
 
 def capture(*options: str) -> dict:
-    result = run.invoke(app, ["capture", "--json", *options])
-    if result.exception is not None:
-        raise result.exception
-    return json.loads(result.stdout)
+    told: dict = answered(app, "capture", *options)
+    return told
 
 
 def test_a_recording_that_does_not_know_its_truth_is_refused(tmp_path: Path) -> None:
@@ -95,8 +92,8 @@ def test_the_demo_recording_calibrates_itself(tmp_path: Path) -> None:
     """End to end: a recording's truth reproduces its geometry to the millimetre."""
     told = capture("--replay", "demo", "--out", str(tmp_path / "p.csv"))
     assert told["pairs"] >= 8
-    result = run.invoke(app, ["solve", "--pairs", str(tmp_path / "p.csv"), "--out", str(tmp_path / "c.toml"), "--json"])
-    matrix = np.array(json.loads(result.stdout)["stack_from_sensor"])
+    solved = answered(app, "solve", "--pairs", tmp_path / "p.csv", "--out", tmp_path / "c.toml")
+    matrix = np.array(solved["stack_from_sensor"])
     eye = np.array([0.0, 0.0, 0.6, 1.0])
     assert np.linalg.norm((matrix - demo_stack_from_sensor()) @ eye) < 0.002
 

@@ -9,17 +9,16 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from calib.commands import app
 from calib.grey_chart import GREYS, AngleRange, grey_charts, histograms, measure, write_lut
 from runtime.config import StackGeometry
 from runtime.panels.lut import measured_curve
 from tests.calib.simulator import Camera, camera_from_stack, ideal_panel, photograph
+from tests.calls import answered
 
 STACK = StackGeometry().stack()
 PANEL = 2
-run = CliRunner()
 
 
 def phase_of(grey: np.ndarray) -> np.ndarray:
@@ -48,10 +47,7 @@ def test_two_photographs_tell_a_panels_curve_without_knowing_the_cameras(
     folder.mkdir()
     for number, picture in enumerate(pictures):
         cv2.imwrite(str(folder / f"{number}.png"), picture)
-    result = run.invoke(
-        app, ["grey", "--photos", str(folder), "--panel", str(PANEL), "--out", str(tmp_path / "lut.csv")]
-    )
-    assert result.exception is None
+    answered(app, "grey", "--photos", folder, "--panel", PANEL, "--out", tmp_path / "lut.csv")
     lut = measured_curve(tmp_path / "lut.csv")[:, 1].astype(float)
     wanted = np.linspace(0, 1, 256)
     shown = np.sin(np.pi / 2 * phase_of(lut)) ** 2

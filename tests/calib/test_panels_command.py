@@ -10,7 +10,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from calib.board import PER_PANEL, board
 from calib.commands import app
@@ -21,18 +20,16 @@ from runtime.config import Settings, StackGeometry, load_settings
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from tests.calib.simulator import error_over_panel_px, in_frame_of, misplaced, simulated_photographs
+from tests.calls import answered, invoked, refusal
 
-run = CliRunner()
 STACK = StackGeometry().stack()
 EYE = viewing_place_m(Settings().calibration)
 CONFIG = '# kept\n[[output.panels]]\nconnector = "A"\n[[output.panels]]\nconnector = "B"\n[[output.panels]]\n'
 
 
 def panels(*options: str) -> dict:
-    result = run.invoke(app, ["panels", *options, "--json"])
-    if result.exception is not None:
-        raise result.exception
-    return json.loads(result.stdout)
+    told: dict = answered(app, "panels", *options)
+    return told
 
 
 @pytest.fixture(scope="module")
@@ -124,9 +121,7 @@ def test_photographs_that_cannot_be_used_are_named_and_nothing_is_written(
     config.write_text(CONFIG)
     for number in (1, 3, 5):
         replaced(photos, number, np.ascontiguousarray(spoil(pictures[number - 1])))
-    with pytest.raises(InputError) as refused:
-        panels("--photos", str(photos), "--out", str(tmp_path / "r"), "--config", str(config), "--write")
-    text = str(refused.value)
+    text = refusal(panels, "--photos", str(photos), "--out", str(tmp_path / "r"), "--config", str(config), "--write")
     assert "4 of 7 photographs are usable" in text
     for number in (1, 3, 5):
         assert f"{number}.bmp" in text
@@ -167,5 +162,5 @@ def test_wrong_requests_are_refused_and_leave_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request_line: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert isinstance(CliRunner().invoke(app, request_line.split()).exception, InputError)
+    assert isinstance(invoked(app, *request_line.split()).exception, InputError)
     assert list(tmp_path.iterdir()) == []

@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from calib.commands import app
 from runtime.errors import InputError
 from runtime.support.picture_file import read_image
 from tests.calib.camera import measured, write_pairs
+from tests.calls import answered
 from tests.eyes.test_calibration_file import PUBLISHED
-
-run = CliRunner()
 
 
 def report(*options: str) -> dict:
-    result = run.invoke(app, ["report", "--json", *options])
-    if result.exception is not None:
-        raise result.exception
-    return json.loads(result.stdout)
+    told: dict = answered(app, "report", *options)
+    return told
 
 
 @pytest.fixture
@@ -30,8 +25,7 @@ def calibration(tmp_path: Path) -> Path:
     sensor = measured(sigma_m=0.003)
     sensor[5] += 0.3
     path = tmp_path / "c.toml"
-    result = run.invoke(app, ["solve", "--pairs", str(write_pairs(tmp_path, sensor)), "--out", str(path), "--json"])
-    assert result.exit_code == 0
+    answered(app, "solve", "--pairs", write_pairs(tmp_path, sensor), "--out", path)
     return path
 
 

@@ -20,6 +20,7 @@ from runtime.errors import ContentFailure, InputError
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack
 from runtime.support.artifacts import write_png
+from tests.calls import refusal
 from tests.content.conftest import panel_view
 
 RED, GREEN, BLUE = (255, 0, 0), (0, 255, 0), (0, 0, 255)
@@ -134,9 +135,7 @@ def test_a_picture_too_small_for_its_views_is_one_line(
     tmp_path: Path, context: Any, stack: PanelStack, name: str, told: str
 ) -> None:
     write_png(tmp_path / name, solid(RED, 1, 1))
-    with pytest.raises(InputError) as refused:
-        opened(tmp_path / name, context, stack)
-    assert str(refused.value).startswith(f"{tmp_path / name}: {told}")
+    assert refusal(opened, tmp_path / name, context, stack).startswith(f"{tmp_path / name}: {told}")
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.mp4", "a.avi"])

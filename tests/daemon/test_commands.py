@@ -10,8 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import typer
-from typer.testing import CliRunner
 
 from runtime.clock import NS_PER_S, SimulatedClock
 from runtime.commands import ctl
@@ -19,6 +17,7 @@ from runtime.commands.ctl import status
 from runtime.daemon.server import StatusServer
 from runtime.errors import InputError
 from runtime.support.logs import RateLimit
+from tests.calls import invoked
 
 ACCOUNT = {
     "state": "degraded: sensor", "reason": "sensor: unplugged", "missing": {"sensor": "unplugged"}, "fps": 31.25,
@@ -53,9 +52,7 @@ def configuration(socket: Path) -> Path:
 
 
 def ask_status(socket: Path, *arguments: str) -> Any:
-    app = typer.Typer()
-    app.command()(status)
-    return CliRunner().invoke(app, [*arguments, "--config", str(configuration(socket))])
+    return invoked(status, *arguments, "--config", configuration(socket))
 
 
 def test_people_see_state_reason_rate_eyes_and_faults_and_machines_one_object(server: StatusServer) -> None:
@@ -102,7 +99,7 @@ def test_every_placement_is_in_the_service_s_log(server: StatusServer, caplog: p
 def test_the_configuration_may_stand_before_the_subcommand(server: StatusServer) -> None:
     thread = threading.Thread(target=lambda: server.commands.get(timeout=60).done(paused=True))
     thread.start()
-    result = CliRunner().invoke(ctl.app, ["--config", str(configuration(server.path)), "pause"])
+    result = invoked(ctl.app, "--config", configuration(server.path), "pause")
     thread.join()
     assert (result.exit_code, result.stdout.split()) == (0, ["paused", "yes"])
 
@@ -172,7 +169,7 @@ def test_every_command_arrives(
 
     thread = threading.Thread(target=loop)
     thread.start()
-    result = CliRunner().invoke(ctl.app, [*arguments, "--config", str(configuration(server.path))])
+    result = invoked(ctl.app, *arguments, "--config", configuration(server.path))
     thread.join()
     assert result.exit_code == 0
     holds = [" ".join(line.split()) for line in result.stdout.splitlines()]

@@ -7,20 +7,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import typer
-from typer.testing import CliRunner
 
 from runtime.clock import NS_PER_S, SimulatedClock
 from runtime.commands.doctor import doctor
 from runtime.daemon.server import StatusServer
+from tests.calls import invoked
 
 
 def examined(tmp_path: Any, text: str = "") -> Any:
     config = tmp_path / "phasestack.toml"
     config.write_text(f'{text}\n[service]\nsocket = "{tmp_path}/status.sock"\n')
-    app = typer.Typer()
-    app.command()(doctor)
-    result = CliRunner().invoke(app, ["--json", "--config", str(config)])
+    result = invoked(doctor, "--json", "--config", config)
     assert result.exception is None or isinstance(result.exception, SystemExit)
     return result.exit_code, {check["name"]: check for check in json.loads(result.stdout)["checks"]}
 

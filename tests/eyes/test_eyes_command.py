@@ -8,8 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import typer
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 from runtime.commands.eyes import eyes as command
 from runtime.errors import InputError
@@ -18,15 +17,14 @@ from runtime.sensor.recording import recording_to
 from runtime.sensor.recording_format import RecordingHeader
 from runtime.support.artifacts import write_png
 from runtime.support.picture_file import read_image
+from tests.calls import invoked
 from tests.eyes.scene import camera, eileen, frame, scene
 
 CAMERA = camera(640, 480, 65.0)
 
 
 def eyes(*arguments: str | Path) -> Result:
-    app = typer.Typer()
-    app.command()(command)
-    return CliRunner().invoke(app, list(map(str, arguments)))
+    return invoked(command, *arguments)
 
 
 def places(count: int) -> list[np.ndarray]:

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
 from numpy.typing import NDArray
-from typer.testing import CliRunner
 
 from runtime.commands.record import record
 from runtime.errors import InputError
@@ -18,9 +15,7 @@ from runtime.eyes.calibration import demo_stack_from_sensor
 from runtime.eyes.motions import MOTIONS, observe, path_of, true_eyes
 from runtime.eyes.two_people import MOTIONS_OF_TWO, true_eyes_of_two
 from runtime.sensor.recording import Recording
-
-app = typer.Typer()
-app.command()(record)
+from tests.calls import answered, invoked
 
 
 def truth_of(path: Path) -> NDArray[np.float64]:
@@ -64,9 +59,7 @@ def test_every_path_is_a_motion_of_its_kind(motion: str, seed: int) -> None:
 def test_the_command_makes_any_of_them(tmp_path: Path, rate_hz: int) -> None:
     out = tmp_path / "new" / "nod.mcap"
     how = ["--motion", "nod", "--seed", "7", "--rate-hz", str(rate_hz), "--noise-mm", "0", "--seconds", "2"]
-    answer = CliRunner().invoke(app, [*how, "--out", str(out), "--json"])
-    assert answer.exit_code == 0, answer.output
-    told = json.loads(answer.stdout)
+    told = answered(record, *how, "--out", out)
     frames = list(Recording(out).samples())
     assert told["samples"] == len(frames) == 2 * rate_hz and told["seed"] == 7
     steps = np.diff([f.capture_ns for f in frames]) * rate_hz / 1e9
@@ -86,7 +79,7 @@ def test_the_command_makes_any_of_them(tmp_path: Path, rate_hz: int) -> None:
     ],
 )
 def test_what_makes_no_sense_is_refused_by_name_and_leaves_nothing(tmp_path: Path, how: list[str], names: str) -> None:
-    answer = CliRunner().invoke(app, [*how, "--out", str(tmp_path / "a.mcap")])
+    answer = invoked(record, *how, "--out", tmp_path / "a.mcap")
     assert isinstance(answer.exception, InputError) and names in str(answer.exception)
     assert list(tmp_path.iterdir()) == []
 

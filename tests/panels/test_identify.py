@@ -13,14 +13,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-import typer
-from typer.testing import CliRunner, Result
 
 from runtime.commands.doctor import doctor, monitors
 from runtime.commands.identify import identify
 from runtime.errors import InputError
 from runtime.panels.card import BARS
 from runtime.panels.geometry import mounting_of, panel_from_screen
+from tests.calls import invoked
 from tests.panels.edids import block
 from tests.panels.xserver import HEIGHT_PX, WIDTH_PX, XServer
 from tests.waiting import eventually
@@ -39,12 +38,6 @@ edid_serial = "A1B2-0003"
 [[output.panels]]
 connector = "DUMMY0"
 """
-
-
-def invoke(command: Callable[..., Any], *arguments: Any) -> Result:
-    app = typer.Typer()
-    app.command()(command)
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
 @pytest.fixture
@@ -128,7 +121,7 @@ def test_the_mounting_that_is_answered_shows_the_card_upright(rotation_deg: int,
 
 def test_without_a_screen_it_says_so_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
-    result = invoke(identify)
+    result = invoked(identify)
     assert isinstance(result.exception, InputError)
     assert "no X server" in str(result.exception)
 
@@ -136,7 +129,7 @@ def test_without_a_screen_it_says_so_in_one_line(monkeypatch: pytest.MonkeyPatch
 @pytest.mark.windows
 def test_the_doctor_lists_monitors_and_their_binding(x: XServer, config: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("runtime.commands.doctor.CHECKS", (monitors,))
-    checks = json.loads(invoke(doctor, "--json", "--config", config).stdout)["checks"]
+    checks = json.loads(invoked(doctor, "--json", "--config", config).stdout)["checks"]
     assert any("A1B2-0003" in check["detail"] for check in checks if check["name"] == "monitor")
     assert [check["state"] for check in checks if check["name"] == "panels"] == ["ok"] * 3
     assert not any(check["remedy"] for check in checks)  # a monitor without a serial is bound by its connector
@@ -148,7 +141,7 @@ def test_the_doctor_names_a_panel_whose_monitor_is_missing(
 ) -> None:
     monkeypatch.setattr("runtime.commands.doctor.CHECKS", (monitors,))
     config.write_text(BOUND.replace("A1B2-0003", "ANOTHER"))
-    result = invoke(doctor, "--json", "--config", config)
+    result = invoked(doctor, "--json", "--config", config)
     failed = {check["name"]: check for check in json.loads(result.stdout)["checks"] if check["state"] == "fail"}
     assert result.exit_code == 1
     assert "panel 1: no monitor has EDID serial ANOTHER" in failed["panels"]["detail"]

@@ -2,26 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 
 import pytest
-import typer
-from typer.testing import CliRunner
 
 from runtime.commands.plan import plan
 from runtime.errors import InputError
-
-app = typer.Typer()
-app.command()(plan)
-runner = CliRunner()
+from tests.calls import answered, invoked
 
 
 def test_it_says_what_is_left_out_with_time_and_error() -> None:
-    done = runner.invoke(app, ["--scene", "sparse", "--scale", "0.5", "--json"])
-    assert done.exit_code == 0, done.output
-    result = json.loads(done.stdout)
+    result = answered(plan, "--scene", "sparse", "--scale", 0.5)
     items = {item["what"]: item for item in result["plan"]}
     assert result["active_fraction"] < 0.3
     assert items["inference outside the active window"]["saves_ms"] > 0
@@ -40,23 +32,23 @@ def test_it_says_what_is_left_out_with_time_and_error() -> None:
 def test_fixed_eyes_that_see_nothing_are_one_line(tmp_path: Path, eyes: str, said: str) -> None:
     config = tmp_path / "phasestack.toml"
     config.write_text(f"[sensor]\nfixed_eyes_m = [{eyes}]\n")
-    done = runner.invoke(app, ["--config", str(config), "--scale", "0.1"])
+    done = invoked(plan, "--config", config, "--scale", "0.1")
     assert str(done.exception).startswith("sensor.fixed_eyes_m: ") and said in str(done.exception)
 
 
 def test_a_wrong_scene_is_one_line(tmp_path: Path) -> None:
-    done = runner.invoke(app, ["--scene", "nowhere"])
+    done = invoked(plan, "--scene", "nowhere")
     assert isinstance(done.exception, InputError)
     assert "nowhere" in str(done.exception)
-    done = runner.invoke(app, ["--config", str(tmp_path / "a.toml")])
+    done = invoked(plan, "--config", tmp_path / "a.toml")
     assert isinstance(done.exception, InputError)
 
 
 def test_what_reuse_costs_agrees_with_what_is_shown_after_the_drift() -> None:
-    done = runner.invoke(app, ["--scene", "sparse", "--scale", "0.2"])
+    done = invoked(plan, "--scene", "sparse", "--scale", "0.2")
     assert done.exit_code == 0, done.output
     told = dict(line.split(maxsplit=1) for line in done.output.splitlines())
-    result = json.loads(runner.invoke(app, ["--scene", "sparse", "--scale", "0.2", "--json"]).stdout)
+    result = answered(plan, "--scene", "sparse", "--scale", 0.2)
     (reuse,) = [item for item in result["plan"] if item["what"] == "render and inference"]
     drifted_db = float(told["psnr_db"]) - float(told["psnr_db_drifted"])
     assert drifted_db == pytest.approx(reuse["costs_db"], abs=0.02) and told["drift_mm"] == "1"
@@ -77,5 +69,5 @@ def test_what_reuse_costs_agrees_with_what_is_shown_after_the_drift() -> None:
     ],
 )
 def test_a_name_that_nothing_has_is_told_by_its_option_and_uncut(option: str, name: str, told: str) -> None:
-    error = runner.invoke(app, [option, name, "--scale", "0.05", "--json"]).exception
+    error = invoked(plan, option, name, "--scale", "0.05", "--json").exception
     assert isinstance(error, InputError) and re.search(told, str(error)) and "..." not in str(error)

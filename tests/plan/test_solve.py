@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-import typer
-from typer.testing import CliRunner
 
 from runtime.commands.solve import solve
 from runtime.support.artifacts import write_json, write_png
-
-app = typer.Typer()
-app.command()(solve)
-runner = CliRunner()
+from tests.calls import answered
 
 
 def pictures(folder: Path, *, grey: bool) -> None:
@@ -35,10 +29,8 @@ def pictures(folder: Path, *, grey: bool) -> None:
 def solved(folder: Path, *more: str, model: str = "balanced") -> dict[str, Any]:
     eyes = ["--left-eye", "0.6", "-0.031", "0", "--right-eye", "0.6", "0.031", "0"]
     files = ["--left", str(folder / "left.png"), "--right", str(folder / "right.png")]
-    where = ["--panels", str(folder / "panels.json"), "--out", str(folder / "out"), "--json"]
-    done = runner.invoke(app, [*files, *eyes, *where, "--model", model, *more])
-    assert done.exit_code == 0, done.output
-    result: dict[str, Any] = json.loads(done.stdout)
+    where = ["--panels", str(folder / "panels.json"), "--out", str(folder / "out")]
+    result: dict[str, Any] = answered(solve, *files, *eyes, *where, "--model", model, *more)
     return result
 
 

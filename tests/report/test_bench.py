@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from runtime.commands.bench import app
 from runtime.errors import InputError
 from runtime.report import benchmark
+from tests.calls import answered, invoked
 
 
 def regression_file(
@@ -78,12 +78,11 @@ def test_the_command_exits_with_1_only_where_something_got_worse(tmp_path: Path)
     old = saved(tmp_path / "old.json", regression_file())
     worse = saved(tmp_path / "worse.json", regression_file(ms=200))
     better = saved(tmp_path / "better.json", regression_file(ms=50))
-    run = CliRunner().invoke(app, ["compare", old, worse])
+    run = invoked(app, "compare", old, worse)
     assert run.exit_code == 1
     assert "worse  balanced 960x540: 2.00 times" in run.output
-    assert CliRunner().invoke(app, ["compare", old, better]).exit_code == 0
-    shown = CliRunner().invoke(app, ["compare", old, worse, "--json"])
-    assert json.loads(shown.stdout)["worse"] == 1
+    assert invoked(app, "compare", old, better).exit_code == 0
+    assert json.loads(invoked(app, "compare", old, worse, "--json").stdout)["worse"] == 1
 
 
 @pytest.mark.parametrize("out", ["", "file/bench.json"])
@@ -92,14 +91,14 @@ def test_an_unusable_output_is_refused_before_the_measurement(
 ) -> None:
     (tmp_path / "file").write_bytes(b"")
     monkeypatch.setattr(benchmark, "measured", lambda **_: pytest.fail("measured first"))
-    answer = CliRunner().invoke(app, ["--out", str(tmp_path / out)])
+    answer = invoked(app, "--out", tmp_path / out)
     assert isinstance(answer.exception, InputError)
 
 
 def test_the_measurement_is_written_where_it_was_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(benchmark, "measured", lambda **_: regression_file())
     out = tmp_path / "new" / "bench.json"
-    assert CliRunner().invoke(app, ["--out", str(out), "--json"]).exit_code == 0
+    assert invoked(app, "--out", out, "--json").exit_code == 0
     assert json.loads(out.read_text()) == regression_file() and [*out.parent.iterdir()] == [out]
 
 
@@ -142,10 +141,9 @@ def test_on_a_busy_machine_times_are_not_compared_and_that_is_said(tmp_path: Pat
     quiet, busy = regression_file(), regression_file(ms=200) | {"yardsticks_ms": [10.0, 10.4, 16.0]}
     assert texts(quiet, busy) == texts(busy, quiet) == []
     paths = [saved(tmp_path / "old.json", quiet), saved(tmp_path / "new.json", busy)]
-    done = CliRunner().invoke(app, ["compare", *paths])
+    done = invoked(app, "compare", *paths)
     assert done.exit_code == 0 and "the same work took 10.0 to 16.0 ms" in done.output
     assert "measure again" in done.output and "worse" not in done.output
-    done = CliRunner().invoke(app, ["compare", *paths, "--json"])
-    assert json.loads(done.stdout)["times_compared"] is False
+    assert answered(app, "compare", *paths)["times_compared"] is False
     busy["methods"][0]["memory_mib"] = 300.0
     assert texts(quiet, busy) == [(True, "1.50 times the memory")]  # other figures are compared

@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-import typer
-from typer.testing import CliRunner
+from typer.testing import Result
 
 from model_export.export import export_model
 from runtime.commands.report import report
@@ -25,13 +24,12 @@ from runtime.report.moving import FULL, Moving, moving_run
 from runtime.report.page import Page, PageSection, Table, describe
 from runtime.report.sections import frontier_section, moving_section, rising
 from runtime.support.artifacts import write_png
+from tests.calls import invoked
 from tests.report.test_pairs import case_folder
 
 
-def command(*arguments: str) -> Any:
-    app = typer.Typer()
-    app.command()(report)
-    return CliRunner().invoke(app, list(arguments))
+def command(*arguments: str) -> Result:
+    return invoked(report, *arguments)
 
 
 def test_mistakes_are_told_before_anything_is_measured_and_nothing_is_written(tmp_path: Path) -> None:

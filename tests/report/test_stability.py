@@ -4,26 +4,23 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-import typer
 from numpy.typing import ArrayLike
-from typer.testing import CliRunner
+from typer.testing import Result
 
 from runtime.commands.stability import stability
 from runtime.errors import InputError
 from runtime.report.stability import optics, suite
 from runtime.report.stability.trial import Answer, Case, Trial, settle
+from tests.calls import invoked
 
 FIELDS = {"name", "stage", "condition", "forward_error", "backward_error", "behaviour", "tolerance", "passed"}
 
 
-def command(*arguments: str) -> Any:
-    app = typer.Typer()
-    app.command()(stability)
-    return CliRunner().invoke(app, list(arguments))
+def command(*arguments: str) -> Result:
+    return invoked(stability, *arguments)
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -14,17 +13,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-import typer
-from typer.testing import CliRunner
 
 from runtime.commands.record import record, record_to
 from runtime.config import Settings, validated
 from runtime.errors import FatalError, InputError
 from runtime.evaluation.motion_recording import write_motion
 from runtime.sensor.recording import Recording
-
-app = typer.Typer()
-app.command()(record)
+from tests.calls import answered, invoked
 
 RUN = "import typer; from runtime.commands.record import record; typer.run(record)"
 
@@ -35,10 +30,9 @@ def settings(**sensor: Any) -> Settings:
 
 def test_a_recording_of_the_demo_has_its_samples(tmp_path: Path) -> None:
     out = tmp_path / "new" / "a.mcap"
-    answer = CliRunner().invoke(app, ["--out", str(out), "--seconds", "1", "--json"])
-    summary = json.loads(answer.stdout)
+    summary = answered(record, "--out", out, "--seconds", 1)
     frames = list(Recording(out).samples())
-    assert answer.exit_code == 0 and summary["samples"] == len(frames) and 25 <= len(frames) <= 31
+    assert summary["samples"] == len(frames) and 25 <= len(frames) <= 31
     assert summary["seconds"] <= 1.0 and summary["stopped"] == "reached the time limit"
     assert frames[0].eyes is not None and frames[0].true_eyes_m is not None
 
@@ -101,7 +95,7 @@ def test_a_motion_replaces_only_a_motion_and_a_sensor_replaces_nothing(tmp_path:
     def made(*arguments: str) -> bool:
         """False: refused, and the existing file stays."""
         before = out.read_bytes() if out.exists() else b""
-        answer = CliRunner().invoke(app, [*arguments, "--out", str(out)])
+        answer = invoked(record, *arguments, "--out", str(out))
         if answer.exit_code == 0:
             return out.read_bytes() != before
         assert isinstance(answer.exception, InputError) and "choose another name" in str(answer.exception)
@@ -118,7 +112,7 @@ def test_a_motion_replaces_only_a_motion_and_a_sensor_replaces_nothing(tmp_path:
 
 @pytest.mark.parametrize("name", ["a.txt", "a", "a.mcap.bak", "x" * 5000 + ".mcap"])
 def test_a_name_without_the_recording_suffix_is_refused_at_once(tmp_path: Path, name: str) -> None:
-    answer = CliRunner().invoke(app, ["--motion", "still", "--out", f"{tmp_path}/{name}"])
+    answer = invoked(record, "--motion", "still", "--out", f"{tmp_path}/{name}")
     assert isinstance(answer.exception, InputError)
     assert list(tmp_path.iterdir()) == []
 
@@ -133,7 +127,7 @@ def test_a_forbidden_place_is_refused_in_one_line(folder: str) -> None:
         (Path(root) / "closed").mkdir(mode=0o700)
         os.seteuid(65534)
         try:
-            answer = CliRunner().invoke(app, ["--seconds", "0.5", "--out", f"{root}/{folder}/a.mcap"])
+            answer = invoked(record, "--seconds", "0.5", "--out", f"{root}/{folder}/a.mcap")
         finally:
             os.seteuid(0)
     assert isinstance(answer.exception, InputError)
@@ -142,11 +136,11 @@ def test_a_forbidden_place_is_refused_in_one_line(folder: str) -> None:
 
 def test_a_file_where_the_folder_should_be_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
-    answer = CliRunner().invoke(app, ["--motion", "still", "--out", str(tmp_path / "file" / "a.mcap")])
+    answer = invoked(record, "--motion", "still", "--out", str(tmp_path / "file" / "a.mcap"))
     assert f"{tmp_path / 'file'} is not a folder" in str(answer.exception)
 
 
 def test_images_of_a_sensor_that_has_none_are_not_claimed(tmp_path: Path) -> None:
-    answer = CliRunner().invoke(app, ["--images", "--seconds", "0.5", "--out", str(tmp_path / "a.mcap")])
+    answer = invoked(record, "--images", "--seconds", "0.5", "--out", str(tmp_path / "a.mcap"))
     assert answer.exit_code == 0 and "eyes" in answer.stdout
     assert "colour" not in answer.stdout

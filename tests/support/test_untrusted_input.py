@@ -6,7 +6,6 @@ import json
 import os
 import socket
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +16,9 @@ from hypothesis import strategies as st
 from runtime.errors import InputError
 from runtime.support import untrusted_input
 from runtime.support.untrusted_input import parsed_json, whole_from_text
+from tests.calls import refusal
 
 HANG_S = 20  # on a busy machine; a hang takes minutes, or never ends
-
-
-def refused(call: Callable[..., Any], *arguments: Any, **named: Any) -> str:
-    with pytest.raises(InputError) as caught:
-        call(*arguments, **named)
-    line = str(caught.value)
-    assert "\n" not in line and "\0" not in line and len(line) < 1000
-    return line
 
 
 @pytest.mark.parametrize("kind", ["fifo", "folder", "socket", "zero", "full", "null", "gone", "loop"])
@@ -44,7 +36,7 @@ def test_only_regular_files_are_read_and_opening_never_waits(tmp_path: Path, kin
     elif kind != "gone":
         path = Path("/dev") / kind
     start = time.monotonic()
-    line = refused(untrusted_input.read_bytes, path, most_bytes=1000)
+    line = refusal(untrusted_input.read_bytes, path, most_bytes=1000)
     assert time.monotonic() - start < HANG_S
     told = {"fifo": "is a FIFO", "folder": "is a folder", "gone": "No such file", "loop": "symbolic links"}
     assert str(path) in line and told.get(kind, "") in line
@@ -53,7 +45,7 @@ def test_only_regular_files_are_read_and_opening_never_waits(tmp_path: Path, kin
 def test_a_file_is_read_up_to_its_limit_and_refused_beyond(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"x" * 1000)
     assert untrusted_input.read_bytes(tmp_path / "a", most_bytes=1000) == b"x" * 1000
-    assert "1000 bytes, but the maximum is 999 bytes" in refused(
+    assert "1000 bytes, but the maximum is 999 bytes" in refusal(
         untrusted_input.read_bytes, tmp_path / "a", most_bytes=999
     )
 
@@ -70,7 +62,7 @@ def test_whether_something_is_there_is_asked_of_names_that_can_be(tmp_path: Path
 
 @pytest.mark.parametrize("path", ["a\0b", "x" * 5000, "y" * 300, "é" * 200, "/".join(["z" * 200] * 30)])
 def test_what_can_be_no_path_is_refused_by_who_gave_it(path: str) -> None:
-    line = refused(untrusted_input.checked_path, path, source="a.toml", field="content.file")
+    line = refusal(untrusted_input.checked_path, path, source="a.toml", field="content.file")
     assert line.startswith("a.toml: content.file: ")
 
 
@@ -78,7 +70,7 @@ def test_text_is_utf_8_with_or_without_a_mark(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"\xef\xbb\xbfx")
     assert untrusted_input.read_text(tmp_path / "a") == "x"
     (tmp_path / "a").write_bytes(b"ab\xffc")
-    assert "is not valid UTF-8 at byte 2" in refused(untrusted_input.read_text, tmp_path / "a")
+    assert "is not valid UTF-8 at byte 2" in refusal(untrusted_input.read_text, tmp_path / "a")
 
 
 json_values = st.recursive(
@@ -97,7 +89,7 @@ def test_json_comes_back_as_it_is(value: Any) -> None:
 @pytest.mark.parametrize("times", [3000, 100_000, 1_000_000])
 def test_json_that_nests_deep_is_refused_in_no_time(opening: str, times: int) -> None:
     start = time.monotonic()
-    assert "nested more than 64" in refused(parsed_json, opening * times, source="a")
+    assert "nested more than 64" in refusal(parsed_json, opening * times, source="a")
     assert time.monotonic() - start < HANG_S
 
 
@@ -105,7 +97,7 @@ def test_json_that_nests_deep_is_refused_in_no_time(opening: str, times: int) ->
 def test_json_may_nest_so_deep_and_no_deeper(opening: str, closing: str) -> None:
     deepest = 64 // len(closing)
     parsed_json(opening * deepest + "0" + closing * deepest, source="a")
-    line = refused(parsed_json, opening * (deepest + 1) + "0" + closing * (deepest + 1), source="a")
+    line = refusal(parsed_json, opening * (deepest + 1) + "0" + closing * (deepest + 1), source="a")
     assert "nested more than 64" in line
 
 
@@ -114,9 +106,9 @@ def test_json_may_nest_so_deep_and_no_deeper(opening: str, closing: str) -> None
     ["NaN", "[Infinity]", '{"a": -Infinity}', '{"a": 1, "b": 2, "a": 1}', "", "{", "9" * 5000 + "x", b"\xff", "\ud800"],
 )
 def test_what_is_no_json_is_refused(text: str | bytes) -> None:
-    refused(parsed_json, text, source="a")
+    refusal(parsed_json, text, source="a")
 
 
 @pytest.mark.parametrize("text", ["²", "٣", "", "-", "1_0", "0x1", "1.0", "9" * 5000, "-1", " ", "½"])
 def test_digits_are_ascii_ones_and_not_too_many(text: str) -> None:
-    assert len(refused(whole_from_text, text, source="a", field="n")) < 200
+    assert len(refusal(whole_from_text, text, source="a", field="n")) < 200
