@@ -7,6 +7,8 @@ import itertools
 import struct
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -40,27 +42,29 @@ def load_compressed_splats(path: Path) -> Gaussians:
     """Read an SPZ file, a SOG file, or a folder with an unpacked SOG file. Raises InputError if it is
     damaged, exceeds a limit, has an unsupported version, or contains no visible splats.
     """
-    try:
-        with np.errstate(all="ignore"):
-            if path.suffix.lower() == ".spz":
-                return _spz(path, untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes))
+    if path.suffix.lower() != ".spz":
+        with _damage_is(path, "is damaged or is not a SOG file"):
             return _sog(path)
-    except (InputError, ImportError, MemoryError):
-        raise
-    except Exception:  # zlib, zipfile and zstandard raise various errors, as does malformed JSON
-        kind = "an SPZ" if path.suffix.lower() == ".spz" else "a SOG"
-        raise InputError(path, "", f"is damaged or is not {kind} file") from None
+    with _damage_is(path, "is damaged or is not an SPZ file"):
+        return _spz(path, untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes))
 
 
 def spz_splats(path: Path, data: bytes) -> Gaussians:
     """Read splats from SPZ data that are part of the file `path`. Raises InputError if they are damaged."""
+    with _damage_is(path, "contains damaged SPZ data"):
+        return _spz(path, data)
+
+
+@contextmanager
+def _damage_is(path: Path, problem: str) -> Iterator[None]:
+    """Raise InputError for the various errors of zlib, zipfile, zstandard and malformed JSON."""
     try:
         with np.errstate(all="ignore"):
-            return _spz(path, data)
+            yield
     except (InputError, ImportError, MemoryError):
         raise
-    except Exception:  # zlib and zstandard raise various errors
-        raise InputError(path, "", "contains damaged SPZ data") from None
+    except Exception:
+        raise InputError(path, "", problem) from None
 
 
 def _spz(path: Path, data: bytes) -> Gaussians:

@@ -5,9 +5,13 @@ A feed's thread keeps the newest picture. The solver never waits for it.
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
 import threading
 import time
 from abc import ABC, abstractmethod
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,9 +22,8 @@ import numpy as np
 from runtime.config import ContentSettings
 from runtime.content import comfort
 from runtime.content.base import ContentInfo, ContentSource, View
-from runtime.content.images import WarpedPicture, plane_from_pixels, rgba_from_rgb
 from runtime.content.layout import MONO, Layout, hint, layout_of, of_film
-from runtime.content.pictures import screen
+from runtime.content.pictures import ShownViews
 from runtime.content.placing import SceneFile
 from runtime.errors import ContentFailure
 from runtime.records import F64, U8
@@ -31,6 +34,7 @@ POINTER_MIN_PX = 12  # smallest height of the mouse pointer
 POINTER_SIZE = 0.03  # height of the mouse pointer, as a fraction of the picture's
 FROZEN_S = 2.0  # a feed counts as frozen after this time without a picture
 CLOSES_WITHIN_S = 2.0
+ENDS_WITHIN_S = 1.0  # time limit for a feed's process to end by itself
 MEASURED_EVERY = 3  # pictures after which the depth of a live picture is measured again
 FOLLOWS = 0.2  # weight of a new measurement of the depth
 LOOKED_AT_EVERY = 30  # pictures after which a flat feed is checked again for two views
@@ -94,8 +98,7 @@ class LiveSource(ContentSource):
         self._feed, self._file = feed, file
         self.info = ContentInfo(feed.name, moving=True, background=file.background, fixed_views=True)
         self._at = 0
-        self._views: list[U8] = []
-        self._shown: dict[int, WarpedPicture] = {}
+        self._shown: ShownViews
         self._depths: tuple[float, float] | None = None  # farthest and nearest disparity, as fractions of the width
         self._measured = 0  # number of the picture whose depth was measured last
         self._layout: tuple[tuple[int, ...], int, Layout] = ((), 0, MONO)  # a picture's shape, number and layout
@@ -111,22 +114,19 @@ class LiveSource(ContentSource):
 
     def render(self, view: View, *, time_ns: int) -> U8:
         self.expect([view], time_ns=time_ns)
-        which = min(view.side, len(self._views) - 1)
-        if which not in self._shown:
-            self._shown[which] = WarpedPicture(rgba_from_rgb(self._views[which]), background=self._file.background)
-        return self._shown[which].warped(self._picture_from_view(view), view)
+        return self._shown.warped(min(view.side, len(self._shown.views) - 1), self._picture_from_view(view), view)
 
     def _picture_from_view(self, view: View) -> F64 | None:
         """Return the homography from a view's pixels to those of the picture, which stands where it is comfortable."""
-        plane_from_view = plane_from_pixels(view.pixels_from_stack, self._screen)
-        if plane_from_view is None or not view.comfort_deg or self._depths is None or len(self._views) < 2:
+        plane_from_view, screen = self._shown.from_view(view), self._shown.screen
+        if plane_from_view is None or not view.comfort_deg or self._depths is None or len(self._shown.views) < 2:
             return plane_from_view
-        width_m = self._screen.width_px * self._screen.pitch_u_m
+        width_m = screen.width_px * screen.pitch_u_m
         most_m = np.radians(view.comfort_deg) * max(view.eye_m[0], 0.0)
         far, near = self._depths
         shift_m, scale = comfort.adjusted(far * width_m, near * width_m, most_m)
-        middle = self._screen.width_px / 2, self._screen.height_px / 2
-        moved_px = (view.side - 0.5) * shift_m / self._screen.pitch_u_m
+        middle = screen.width_px / 2, screen.height_px / 2
+        moved_px = (view.side - 0.5) * shift_m / screen.pitch_u_m
         picture_from_plane = np.array(
             [
                 [1 / scale, 0, middle[0] - (middle[0] + moved_px) / scale],
@@ -151,20 +151,17 @@ class LiveSource(ContentSource):
             raise ContentFailure(f"{self._feed.name}: {error}") from None
         if newest.pointer is not None:
             parts = with_pointer(parts, layout, newest.pointer)
-        height, width = parts[0].shape[:2]
-        aspect = layout.pixel_aspect(width_px=width, height_px=height)
-        self._screen = screen(self._file.stack, width_px=width, height_px=height, pixel_aspect=aspect)
-        self._views, self._at, self._shown = parts, newest.number, {}
+        self._shown, self._at = ShownViews(parts, layout, self._file), newest.number
         self._measure(is_limited=views[0].comfort_deg > 0)
 
     def _measure(self, *, is_limited: bool) -> None:
         """Follow the depth of the views, if it is limited."""
-        if not is_limited or len(self._views) != 2:
+        if not is_limited or len(self._shown.views) != 2:
             self._depths = None
             return
         if self._depths is not None and self._at < self._measured + MEASURED_EVERY:
             return
-        found, self._measured = comfort.disparities(*self._views), self._at
+        found, self._measured = comfort.disparities(*self._shown.views), self._at
         if found is not None and self._depths is not None:
             far, near = ((1 - FOLLOWS) * old + FOLLOWS * new for old, new in zip(self._depths, found))
             found = far, near
@@ -183,13 +180,22 @@ class LiveSource(ContentSource):
         self._feed.close()
 
 
-def with_pointer(views: list[U8], layout: Layout, place: tuple[float, float]) -> list[U8]:
-    """Return copies of views with a mouse pointer at the same place in all, which is the screen's depth.
+def end_group(process: subprocess.Popen[bytes]) -> None:
+    """End a process that leads a session, and those that it started."""
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGTERM)
+    try:
+        process.wait(ENDS_WITHIN_S)
+    except subprocess.TimeoutExpired:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
 
-    Args:
-        views: Views of a picture, as returned by `layout.views`.
-        layout: Layout of the picture. Views of quilts and panoramas are returned unchanged.
-        place: Pointer's place in the whole picture, as fractions of its width and height.
+
+def with_pointer(views: list[U8], layout: Layout, place: tuple[float, float]) -> list[U8]:
+    """Return copies of a picture's views with a mouse pointer at the same place in all, which is the screen's depth.
+    `place` is the pointer's in the whole picture, as fractions of its width and height. Views of quilts and panoramas
+    are returned unchanged.
     """
     if layout.kind == "quilt" or layout.span_deg:
         return views

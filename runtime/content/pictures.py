@@ -10,10 +10,11 @@ import numpy as np
 from runtime.content.base import ContentInfo, ContentSource, View
 from runtime.content.frames import Frames, open_frames
 from runtime.content.images import WarpedPicture, plane_from_pixels, rgba_from_rgb
+from runtime.content.layout import Layout
 from runtime.content.placing import SceneFile
 from runtime.errors import ContentFailure, InputError
 from runtime.optics.stack import PanelStack, PlaneRaster
-from runtime.records import U8
+from runtime.records import F64, U8
 
 
 def screen(stack: PanelStack, *, width_px: int, height_px: int, pixel_aspect: float = 1.0) -> PlaneRaster:
@@ -28,6 +29,27 @@ def screen(stack: PanelStack, *, width_px: int, height_px: int, pixel_aspect: fl
         width_px=width_px,
         height_px=height_px,
     )
+
+
+class ShownViews:
+    """Views of one picture on the plane through the display's centre, ready to be warped."""
+
+    def __init__(self, views: list[U8], layout: Layout, file: SceneFile) -> None:
+        height, width = views[0].shape[:2]
+        aspect = layout.pixel_aspect(width_px=width, height_px=height)
+        self.views, self._background = views, file.background
+        self.screen = screen(file.stack, width_px=width, height_px=height, pixel_aspect=aspect)
+        self._warped: dict[int, WarpedPicture] = {}
+
+    def from_view(self, view: View) -> F64 | None:
+        """Return the 3x3 homography from an eye's view to the views' pixels, or None if the eye is in their plane."""
+        return plane_from_pixels(view.pixels_from_stack, self.screen)
+
+    def warped(self, number: int, picture_from_view: F64 | None, view: View) -> U8:
+        """Return a view warped to an eye's raster, as `WarpedPicture` does."""
+        if number not in self._warped:
+            self._warped[number] = WarpedPicture(rgba_from_rgb(self.views[number]), background=self._background)
+        return self._warped[number].warped(picture_from_view, view)
 
 
 def prepare(file: SceneFile) -> Callable[..., ContentSource]:
@@ -68,29 +90,21 @@ class PicturesSource(ContentSource):
                 self._take(number, self._frames.frame(number))
             except ValueError as error:
                 raise ContentFailure(f"{self.info.name}: {error}") from None
-        which = self._view_for(view)
-        if which not in self._shown:
-            self._shown[which] = WarpedPicture(rgba_from_rgb(self._views[which]), background=self._file.background)
-        matrix = plane_from_pixels(view.pixels_from_stack, self._screen)
-        return self._shown[which].warped(matrix, view)
+        return self._shown.warped(self._view_for(view), self._shown.from_view(view), view)
 
     def _take(self, number: int, picture: U8) -> None:
         """Split a picture into views, and show these now. Raises ValueError if it is too small for its layout."""
         layout = self._frames.layout(number)
-        views = layout.views(picture)
-        height, width = views[0].shape[:2]
-        aspect = layout.pixel_aspect(width_px=width, height_px=height)
-        self._screen = screen(self._file.stack, width_px=width, height_px=height, pixel_aspect=aspect)
-        self._shown: dict[int, WarpedPicture] = {}
-        self._views, self._at = views, number  # `_at` is the picture's number
+        self._shown, self._at = ShownViews(layout.views(picture), layout, self._file), number
 
     def _view_for(self, view: View) -> int:
         """Return the index of the view that an eye sees: by its side in a stereo picture, by its angle in a quilt."""
-        if len(self._views) <= 2:
-            return min(view.side, len(self._views) - 1)
+        count = len(self._shown.views)
+        if count <= 2:
+            return min(view.side, count - 1)
         angle = np.arctan2(view.eye_m[1], view.eye_m[0])
-        place = (angle / np.radians(self._file.settings.cone_deg) + 0.5) * (len(self._views) - 1)
-        return int(np.clip(np.rint(place), 0, len(self._views) - 1))
+        place = (angle / np.radians(self._file.settings.cone_deg) + 0.5) * (count - 1)
+        return int(np.clip(np.rint(place), 0, count - 1))
 
     def revision(self, *, time_ns: int) -> int:
         return self._frames.at(time_ns)

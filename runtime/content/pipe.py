@@ -7,7 +7,6 @@ import select
 import stat
 import subprocess
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from pydantic import Field, model_validator
 
 from runtime.config import Section, validated
 from runtime.content.base import ContentSource
-from runtime.content.live import Feed, LiveSource
+from runtime.content.live import Feed, LiveSource, end_group
 from runtime.content.placing import SceneFile
 from runtime.errors import InputError, one_line
 from runtime.records import U8
@@ -109,13 +108,7 @@ class PipeFeed(Feed):
             os.close(self._file)
             self._file = -1
         if process is not None:
-            with suppress(ProcessLookupError):
-                os.killpg(process.pid, 15)
-            try:
-                process.wait(1.0)
-            except subprocess.TimeoutExpired:
-                os.killpg(process.pid, 9)
-                process.wait()
+            end_group(process)
             if process.returncode > 0 and not self._ends.is_set():
                 self.problem = f"{self.name}: ended with exit status {process.returncode}"
 

@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any
@@ -19,7 +19,7 @@ from pydantic import Field, model_validator
 
 from runtime.config import Section, validated
 from runtime.content.base import ContentSource
-from runtime.content.live import Feed, LiveSource
+from runtime.content.live import Feed, LiveSource, end_group
 from runtime.content.placing import SceneFile
 from runtime.content.x_pointer import BUTTON, Pointed, XPointer
 from runtime.errors import InputError, one_line
@@ -218,7 +218,7 @@ class WindowFeed(Feed):
         finally:
             for one in (process, server):
                 if one is not None:
-                    _ended(one)
+                    end_group(one)
 
 
 def pointer_in(now: Pointed | None, place: Place | None, size_px: tuple[int, ...]) -> tuple[float, float] | None:
@@ -228,15 +228,3 @@ def pointer_in(now: Pointed | None, place: Place | None, size_px: tuple[int, ...
     left, top = (0, 0) if place is None else (place.x, place.y)
     u, v = (now.x - left + 0.5) / size_px[1], (now.y - top + 0.5) / size_px[0]
     return (u, v) if 0 <= u < 1 and 0 <= v < 1 else None
-
-
-def _ended(process: subprocess.Popen[bytes]) -> None:
-    """End a process and those that it started."""
-    with suppress(ProcessLookupError):
-        os.killpg(process.pid, 15)
-    try:
-        process.wait(1.0)
-    except subprocess.TimeoutExpired:
-        with suppress(ProcessLookupError):
-            os.killpg(process.pid, 9)
-        process.wait()

@@ -1,4 +1,4 @@
-"""Colours declared by code (ITU-T H.273): ICC profiles for pictures, and sRGB for films."""
+"""Colours of pictures and films: those declared by code (ITU-T H.273), and transparent ones over a background."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ NCLX = re.compile(rb"colrnclx(..)(..)", re.DOTALL)
 SEARCHED = 1 << 18  # number of bytes at the beginning of a file to search for the colour codes
 PQ, HLG = 16, 18  # transfer characteristics codes; all other codes are treated as sRGB
 BRIGHT = (PQ, HLG)
+Colour = tuple[float, float, float]  # sRGB components in [0, 1]
 PAPER_NITS, PQ_NITS = 203.0, 10_000.0  # white's luminance (ITU-R BT.2408), and PQ's maximum luminance
 PRIMARIES = {  # XYZ of red, green and blue, keyed by code and adapted to D50; code 1 (BT.709) has sRGB's primaries
     1: ((0.43607, 0.22249, 0.01392), (0.38515, 0.71687, 0.09708), (0.14307, 0.06061, 0.71410)),
@@ -24,6 +25,12 @@ D50 = (0.9642, 1.0, 0.8249)
 SRGB_CURVE = (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)  # an ICC curve's parameters g, a, b, c, d
 SAMPLES = 4096  # number of samples in a transfer curve
 ROWS = 32  # rows converted together, which fit into a processor's cache
+
+
+def composed(colour: U8, alpha: U8, background: Colour) -> U8:
+    """Compose pictures (h, w, 3), rounded: colour·a + background·(1 - a), with `alpha` (h, w, 1) = 255·a."""
+    behind = np.array([round(255 * value) for value in background], np.uint16) * (255 - alpha.astype(np.uint16))
+    return np.asarray((colour.astype(np.uint16) * alpha + behind + 127) // 255, np.uint8)  # terms below 65,153
 
 
 def stated_profile(coded: bytes) -> bytes:

@@ -20,7 +20,7 @@ from runtime.clock import NS_PER_MS, NS_PER_S
 from runtime.errors import InputError, SensorLost
 from runtime.records import U8
 from runtime.support import progress, untrusted_input
-from runtime.support.coded_colours import BRIGHT, srgb_from
+from runtime.support.coded_colours import BRIGHT, Colour, composed, srgb_from
 
 CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
 COVER = 1024  # FFmpeg's AV_DISPOSITION_ATTACHED_PIC
@@ -181,7 +181,7 @@ class Film:
             if not packet.size:  # the stream's end
                 yield from ((index, one) for one in _filtered(graphs.pop(index, None), None))
 
-    def rgb(self, frames: tuple[av.VideoFrame, ...], *, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> U8:
+    def rgb(self, frames: tuple[av.VideoFrame, ...], *, background: Colour = (0.0, 0.0, 0.0)) -> U8:
         """Convert frames to an upright (h, w, 3) picture over a background, with two views side by side."""
         views = [_rgb(frame, background) for frame in frames]
         return views[0] if len(views) == 1 else np.concatenate(views, axis=1)
@@ -299,12 +299,10 @@ def _filtered(graph: Any, frame: av.VideoFrame | None) -> Iterator[av.VideoFrame
             yield graph.vpull()
 
 
-def _rgb(frame: av.VideoFrame, background: tuple[float, float, float]) -> U8:
+def _rgb(frame: av.VideoFrame, background: Colour) -> U8:
     if any(component.is_alpha for component in frame.format.components):
-        rgba = frame.to_ndarray(format="rgba")
-        alpha = rgba[..., 3:].astype(np.uint16)
-        under = np.array([round(255 * value) for value in background], np.uint16) * (255 - alpha)
-        picture = ((rgba[..., :3] * alpha + under + 127) // 255).astype(np.uint8)
+        rgba = np.asarray(frame.to_ndarray(format="rgba"), np.uint8)
+        picture = composed(rgba[..., :3], rgba[..., 3:], background)
     else:
         picture = np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
     if frame.color_trc in BRIGHT:

@@ -15,7 +15,7 @@ from PIL import Image, ImageCms, ImageOps
 from runtime.errors import InputError
 from runtime.records import U8
 from runtime.support.artifacts import held_back
-from runtime.support.coded_colours import stated_profile
+from runtime.support.coded_colours import Colour, composed, stated_profile
 from runtime.support.picture_header import (
     ORIENTATION,
     check_size,
@@ -28,7 +28,6 @@ from runtime.support.untrusted_input import LIMITS
 
 log = logging.getLogger("phasestack.pictures")
 
-Colour = tuple[float, float, float]  # sRGB components in [0, 1]
 WHITE: Colour = (1.0, 1.0, 1.0)
 ROWS_AT_ONCE = 64  # number of rows converted together, to limit memory use
 LATTICE = 9  # a colour profile is compared with sRGB at this number of values per channel
@@ -106,7 +105,6 @@ def rgb_of(image: Any, source: object, *, background: Colour = WHITE) -> U8:
     colours = "CMYK" if image.mode == "CMYK" else "L" if image.mode in ("1", "L", "LA", *DEEP) else "RGB"
     to_srgb = _to_srgb(profile, colours, source) if profile else None
     is_clear = image.has_transparency_data
-    behind = np.array([round(value * 255) for value in background], np.uint16)
     result = np.empty((image.height, image.width, 3), np.uint8)
     for first in range(0, image.height, ROWS_AT_ONCE):  # intermediate values need several times the result's memory
         rows = slice(first, min(first + ROWS_AT_ONCE, image.height))
@@ -115,14 +113,8 @@ def rgb_of(image: Any, source: object, *, background: Colour = WHITE) -> U8:
         part = part.convert(colours)
         result[rows] = np.asarray(to_srgb(part) if to_srgb else part.convert("RGB"))
         if alpha is not None:
-            result[rows] = composed(result[rows], alpha, behind)
+            result[rows] = composed(result[rows], alpha, background)
     return result
-
-
-def composed(colour: U8, alpha: U8, behind: Any) -> U8:
-    """Compose pictures (h, w, 3), rounded: colour·a + behind·(1 - a), with `alpha` (h, w, 1) = 255·a."""
-    mixed = colour.astype(np.uint16) * alpha + behind.astype(np.uint16) * (255 - alpha.astype(np.uint16))  # < 65,026
-    return np.asarray((mixed + 127) // 255, np.uint8)
 
 
 def _upright(image: Any) -> Any:
