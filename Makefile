@@ -8,6 +8,7 @@ TEST_WORKERS ?= logical
 FUZZ_ARGS ?=
 ROOM ?= frame
 MUTATE_ARGS ?=
+FAULT_ARGS ?=
 GOLDEN_ARGS ?=
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
@@ -18,7 +19,7 @@ SANITIZED := out/sanitized
 SANITIZERS := -fsanitize=address,undefined -fno-sanitize-recover=all
 SANITIZE_ARGS ?=
 
-.PHONY: demo test test-setup test-slow golden lint types secrets coverage nightly package bench fuzz mutate soak install uninstall system eye-models models gallery site hashes clean
+.PHONY: demo test test-setup test-slow golden lint types secrets coverage nightly package bench fuzz mutate soak faults install uninstall system eye-models models gallery site hashes clean
 
 demo: $(VENV)/.runtime
 	$(BIN)/phasestack demo $(DEMO_ARGS)
@@ -94,6 +95,10 @@ sanitize: $(VENV)/.test
 
 soak: $(VENV)/.test
 	$(BIN)/python -m tests.soak
+
+# Each fault of a solver or a sensor ten times while a viewer walks, and what it costs; FAULT_ARGS="--tries 3".
+faults: $(VENV)/.test
+	$(BIN)/python -m tests.faults $(FAULT_ARGS)
 
 install: system
 	sh systemd/install.sh

@@ -16,8 +16,8 @@ from tests.deeds import DEEDS
 
 
 def _grow() -> None:
-    """Take 512 MiB, which is less than what makes Python raise MemoryError, and keep it."""
-    kept = [np.ones(1 << 23) for _ in range(8)]
+    """Take 640 MiB, which is less than what makes Python raise MemoryError, and keep it."""
+    kept = [np.ones(1 << 23) for _ in range(10)]
     ctypes.CDLL(None).sleep(3600)
     del kept
 

@@ -20,6 +20,7 @@ from runtime.model.session import ModelSession
 from runtime.records import RefreshAccount
 from tests.daemon.rig import TRACKING, Rig
 from tests.daemon.test_notify import Supervisor
+from tests.faults import FAULTS, tried
 from tests.soak import soak
 
 
@@ -185,3 +186,12 @@ def test_the_watchdog_outlives_a_hung_solver_but_not_an_endless_refresh(fed: Rig
 @pytest.mark.slow
 def test_faults_and_changes_pile_nothing_up_and_all_requests_are_answered() -> None:
     soak(90.0, growth_mib=200)  # so early, everything still grows
+
+
+@pytest.mark.slow
+def test_every_fault_has_its_reason_and_the_display_recovers() -> None:
+    reasons = {f"{fault.role}: {fault.what}": costs.reasons[0] for fault, costs in tried(FAULTS, size_px=(192, 108))}
+    ends = {"SIGSEGV": "SIGSEGV", "SIGKILL": "SIGKILL", "sys.exit": "no licence", "memory": "memory limit",
+            "context": "reset the GPU", "load crashes": "SIGSEGV"}  # fmt: skip
+    for name, reason in reasons.items():
+        assert ends.get(name.partition(": ")[2], "not answered in time") in reason, reasons

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from runtime.clock import Clock
+from runtime.clock import NS_PER_S, Clock
 from runtime.config import Section
 from runtime.errors import FatalError
 from runtime.records import EyePoints, SensorFrame
@@ -24,6 +24,7 @@ class HarmfulOptions(Section):
 
     file: str
     opening: bool = False  # do it in `open`, not in `read_newest`
+    walking: bool = False  # walk 0.3 m to either side every four seconds instead of swaying
 
 
 def _refuses() -> None:
@@ -42,6 +43,7 @@ class Harmful(Sensor):
 
     def __init__(self, options: HarmfulOptions, *, clock: Clock) -> None:
         self._file, self._opening, self._clock, self._count = Path(options.file), options.opening, clock, 0
+        self._walking = options.walking
 
     def open(self) -> None:
         self.serial = self.serial or f"H-{os.getpid()}"
@@ -51,8 +53,9 @@ class Harmful(Sensor):
         time.sleep(0.01)
         self._do_deed(not self._opening)
         self._count += 1
-        eyes_m = EYES_M + np.array([0.0, 0.002 * np.sin(self._count / 10), 0.0])
-        return SensorFrame(self._count, self._clock.now_ns(), EyePoints(eyes_m, np.ones(2)))
+        now_ns = self._clock.now_ns()
+        aside_m = 0.3 * np.sin(np.pi / 2 * now_ns / NS_PER_S) if self._walking else 0.002 * np.sin(self._count / 10)
+        return SensorFrame(self._count, now_ns, EyePoints(EYES_M + np.array([0.0, aside_m, 0.0]), np.ones(2)))
 
     def _do_deed(self, now: bool) -> None:
         deed = ""
