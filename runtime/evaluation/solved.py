@@ -95,7 +95,7 @@ class SolvedPair:
         return self.eye_views.viewer(self.layers, [headline(self.quality.light_db["1"]), *lines])
 
     def write(self, folder: Path, *, lines: Sequence[str], floats: F32 | None = None) -> None:
-        """Write the layers, also as `floats` before rounding, eye views, contact sheet and viewer page to a folder."""
+        """Write the layers (and `floats`, if given), eye views, contact sheet and viewer page to a folder."""
         for n, layer in enumerate(self.layers):
             write_png(folder / f"layer-{n}.png", layer)
         if floats is not None:
