@@ -117,9 +117,13 @@ def _read_rows(path: Path) -> tuple[list[str], list[PairRow]]:
             reader.fieldnames = [name.strip().lower() for name in reader.fieldnames or ()]
             columns = set(reader.fieldnames)
             # An empty cell is a missing value.
-            read = [(f"line {reader.line_num}", {k: v for k, v in row.items() if k and v}) for row in reader]
+            read = [(f"line {reader.line_num}", {k: v for k, v in row.items() if v}) for row in reader]
         except csv.Error as error:
             raise InputError(path, f"line {reader.line_num}", f"malformed: {error}") from None
+        for label, row in read:
+            if any(row.pop(None, ())):  # values beyond the last column
+                more = "has more values than there are columns; with decimal commas, separate columns by semicolons"
+                raise InputError(path, label, more)
         labels, items = [label for label, _ in read], [row for _, row in read]
     missing = [name for name in COLUMNS if name not in columns]
     if missing:

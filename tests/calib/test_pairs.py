@@ -94,3 +94,6 @@ def test_pairs_from_a_german_spreadsheet_are_read(tmp_path: Path) -> None:
     assert found.sensor_m.tolist() == [[0.1, 0.2, -0.3]] and found.stack_m.tolist() == [[4.0, 5.5, 6.0]]
     with pytest.raises(InputError, match="line 2, sensor_y: is not a number"):
         read_pairs(file(tmp_path, text.replace("0,2", "0,2,5")))
+    with pytest.raises(InputError, match="line 2: has more values than there are columns; with decimal commas"):
+        read_pairs(file(tmp_path, text.replace(";", ",")))
+    assert len(read_pairs(file(tmp_path, text.replace("\n", ";;\n")))) == 1  # empty columns at the right
