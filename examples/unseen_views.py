@@ -18,6 +18,8 @@ from PIL import Image
 
 import phasestack
 from runtime.content.eyereal import Pair, read_folder
+from runtime.content.presets import preset_names
+from runtime.errors import InputError
 
 WIDTH_M, HEIGHT_M, X_M = 0.5184, 0.2916, (-0.06, 0.0, 0.06)  # the published code's display
 FOV_DEG = 40.0
@@ -43,12 +45,16 @@ def evaluated(pairs: Sequence[Pair], model: str) -> dict[str, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--preset", required=True, help="the scene's name, such as lego_bulldozer")
+    names = {"choices": preset_names(), "metavar": "NAME", "help": "the scene's name, such as lego_bulldozer"}
+    parser.add_argument("--preset", required=True, **names)
     parser.add_argument("--model", action="append", help="a model's name or ONNX file (can be repeated)")
     asked = parser.parse_args()
-    pairs = read_folder(asked.folder, asked.preset)
-    for model in asked.model or ["balanced"]:
-        print(json.dumps({"model": Path(model).stem, "pairs": len(pairs), **evaluated(pairs, model)}), flush=True)
+    try:
+        pairs = read_folder(asked.folder, asked.preset)
+        for model in asked.model or ["balanced"]:
+            print(json.dumps({"model": Path(model).stem, "pairs": len(pairs), **evaluated(pairs, model)}), flush=True)
+    except (InputError, OSError, ValueError) as error:
+        parser.error(str(error))
 
 
 if __name__ == "__main__":

@@ -75,8 +75,9 @@ def report(
     for result in sorted(record["methods"], key=lambda r: (r["x_m"], r["width_px"], r["ms_p50"])):
         size = f"{len(result['x_m'])} panels {result['width_px']}x{result['height_px']}"
         light = result["light_db"].get("1", float("nan"))
+        memory = "" if result["kind"] == "layers" else f" {result['memory_mib']:7.0f} MiB"
         print(
             f"{result['name']:18}{size:>20}{result['ms_p50']:10.1f} ms   "
-            f"light {light:6.2f} dB, one ray {result['psnr_db']:6.2f} dB {result['memory_mib']:7.0f} MiB"
+            f"light {light:6.2f} dB, one ray {result['psnr_db']:6.2f} dB{memory}"
         )
     print(f"see {out / 'index.html'} (the figure to quote is the light PSNR, which assumes a tracking error of 1 mm)")

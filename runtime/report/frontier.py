@@ -93,7 +93,7 @@ def stored_run(method: Method, pair: StillPair) -> MethodRun:
         if layer.shape[:2] != size:
             shape = f"{layer.shape[1]}x{layer.shape[0]} pixels, but the case's panels have {size[1]}x{size[0]}"
             raise InputError(folder / pair.name / f"layer-{n}.png", "", f"has {shape}")
-    return MethodRun(np.stack([layer[..., :3] for layer in layers]), (float(time_ms),), 0.0, 0, "")
+    return MethodRun(np.stack([layer[..., :3] for layer in layers]), (float(time_ms),), math.nan, 0, "")
 
 
 def shipped_and_references(models: Sequence[str] = (), *, quick: bool = False) -> list[Method]:
@@ -109,7 +109,7 @@ class MethodRun:
 
     layers: U8  # (N, h, w, 3), rear to front
     run_ms: tuple[float, ...]  # times taken by complete solutions, from two decoded images to N 8-bit layers
-    memory_mib: float  # the process's peak memory
+    memory_mib: float  # the process's peak memory; NaN for layers from elsewhere
     parameters: int
     precision: str
 

@@ -94,7 +94,8 @@ def method_table(results: Sequence[MethodResult]) -> Table:
         seen += [r.psnr_db_off_eye.get(key) for key in beside]
         told = ["" if value is None else f"{value:.4g}" for value in seen]
         times = [f"{r.ms_p50 / ordered[0].ms_p50:.1f}", f"{r.ms_p50:.1f}", f"{r.ms_p99:.1f}"]
-        rows.append([r.name, *times, f"{r.memory_mib:.0f}", f"{r.parameters:,}", *told])
+        costs = ["", ""] if r.kind == "layers" else [f"{r.memory_mib:.0f}", f"{r.parameters:,}"]
+        rows.append([r.name, *times, *costs, *told])
     size = f"{ordered[0].width_px}x{ordered[0].height_px}"
     caption = f"Panels have {size}. The worst eye is the worst of all pairs with one ray per pixel."
     return Table(headings, rows, caption)

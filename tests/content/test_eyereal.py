@@ -152,10 +152,10 @@ def test_a_folder_of_unseen_views_is_evaluated_with_any_model(tmp_path: Path, co
     for number in range(2):
         write_pair(tmp_path, context, stack, number, dy=0.1 * number)
     command = [sys.executable, str(ROOT / "examples" / "unseen_views.py"), str(tmp_path), "--preset", LEGO]
-    done = subprocess.run(
-        [*command, "--model", "fast", "--model", "sart"],
-        env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True, timeout=200, check=True,
-    )  # fmt: skip
+    how: Any = {"env": os.environ | {"PYTHONPATH": str(ROOT)}, "capture_output": True, "text": True, "timeout": 200}
+    done = subprocess.run([*command, "--model", "fast", "--model", "sart"], check=True, **how)
     told = [json.loads(line) for line in done.stdout.splitlines()]
     assert [(one["model"], one["pairs"]) for one in told] == [("fast", 2), ("sart", 2)]
+    wrong = subprocess.run([*command, "--preset", "none"], check=False, **how)
+    assert wrong.returncode == 2 and "invalid choice: 'none'" in wrong.stderr.splitlines()[-1]
     assert all(one["psnr_db"] > 28 and 0.8 < one["ssim"] <= 1 and one["light_db"] > 20 for one in told)

@@ -101,6 +101,7 @@ def test_cases_are_grouped_by_stack_and_another_solver_s_layers_join_them(tmp_pa
     record = json.loads((tmp_path / "out" / "report.json").read_text())
     theirs = [one for one in record["methods"] if one["name"] == "theirs"]
     assert [len(one["x_m"]) for one in theirs] == [3, 2] and [one["ms_p50"] for one in theirs] == [11.75, 13]
+    assert {one["memory_mib"] for one in theirs} == {None}
     assert [[pair["pair"] for pair in one["pairs"]] for one in theirs] == [["a", "b"], ["c"]]
     titles = {what.partition(": ")[2].partition(":")[0] for what in started}
     assert titles == {"2 case files, 3 panels 50 mm apart, 32x18", "1 case file, 2 panels 50 mm apart, 32x18"}
