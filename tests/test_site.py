@@ -41,20 +41,8 @@ def test_the_python_that_a_page_shows_runs(page: str, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_site_builds_without_warnings_with_every_page_and_the_api(tmp_path: Path) -> None:
     pytest.importorskip("furo")
-    command = [
-        sys.executable,
-        "-m",
-        "sphinx",
-        "-q",
-        "-W",
-        "--keep-going",
-        "-b",
-        "html",
-        "-c",
-        "docs/site",
-        ".",
-        str(tmp_path),
-    ]
+    build = "-m sphinx -q -W --keep-going -b html -c docs/site ."
+    command = [sys.executable, *build.split(), str(tmp_path)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=1800)
     assert done.returncode == 0, done.stderr
     for page in PAGES:

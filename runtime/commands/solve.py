@@ -81,15 +81,14 @@ def solve(
 
     with blame_option("solve", model=model):
         watch = Stopwatch()
-        given: dict[str, object] = {
-            "--left": left,
-            "--right": right,
-            "--layout": layout,
-            "--panels": panels,
-            "--camera": camera,
-        }
-        given |= {"--camera": camera, "--left-eye": left_eye, "--right-eye": right_eye}
         if case is not None:
+            pictures: dict[str, object] = {"--left": left, "--right": right, "--layout": layout}
+            given = pictures | {
+                "--panels": panels,
+                "--camera": camera,
+                "--left-eye": left_eye,
+                "--right-eye": right_eye,
+            }
             asked = case_asked_for(case, [option for option, value in given.items() if value is not None])
         else:
             asked = asked_for(Files.of(left, right, layout), Eyes(left_eye, right_eye, fov, camera), panels)

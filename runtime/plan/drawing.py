@@ -110,9 +110,7 @@ def _nearness(
     content: ContentSource, pair: Sequence[View], window: SolveWindow | None, *, every: int
 ) -> list[F32 | None]:
     """Return the inverse distances of the content that was just drawn for a person's views, if the source knows them.
-
-    Args:
-        every: Side of a relief pixel, in panel pixels.
+    A relief pixel has a side of `every` panel pixels.
     """
     u0, v0 = (0, 0) if window is None else (window.box.u0, window.box.v0)
     return [content.nearness(view, every=every, first=(u0 % every, v0 % every)) for view in pair]
@@ -127,11 +125,7 @@ def _relief(
     every: int,
 ) -> F32 | None:
     """Return the relief, on the middle panel, of the content drawn for all views, or None if a depth is unknown.
-
-    Args:
-        depths: Each view's inverse distances (`_nearness`).
-        window: Window that was drawn on the middle panel. If None, the whole panel was drawn.
-        every: Side of a relief pixel, in panel pixels.
+    `depths` are each view's inverse distances (`_nearness`), in the window that was drawn, if not the whole panel was.
     """
     known = [depth for depth in depths if depth is not None]
     if len(known) < len(views):

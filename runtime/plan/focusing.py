@@ -9,16 +9,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Literal
 
-import numpy as np
-
-from runtime.content.base import ContentInfo, ContentSource, View
+from runtime.content.base import ContentInfo, ContentSource
 from runtime.errors import ContentFailure
 from runtime.model.job import Job, drawn_views
 from runtime.optics.focus import SOLVED_POINTS_M, points_of_pupils
 from runtime.optics.relief import block_px
 from runtime.optics.stack import PlaneRaster
-from runtime.optics.views import raster_from_stack
-from runtime.records import F64, Eyes
+from runtime.plan.drawing import raster_views
 
 Focus = Literal["off", "auto", "on"]
 
@@ -32,19 +29,9 @@ def may_focus(info: ContentInfo, focus: Focus) -> bool:
 
 
 def focused_job(content: ContentSource, job: Job, *, time_ns: int, focus: Focus) -> Job | None:
-    """Draw content for further points of the pupils, and return a job that includes them.
-
-    Args:
-        content: The content that `job` was drawn from last.
-        job: Job on the full raster, for pinhole eyes.
-        time_ns: Time on the run's clock that `job` was drawn for.
-        focus: `content.focus`.
-
-    Returns:
-        The job, or None if the content does not qualify.
-
-    Raises:
-        ContentFailure: The content could not be drawn.
+    """Draw content for further points of the pupils, and return a job that includes them, or None if the content does
+    not qualify. `job` was the last to be drawn from the content, for pinhole eyes on the full raster at the same time.
+    Raises ContentFailure if the content cannot be drawn.
     """
     raster = _drawn_on(job)
     if not may_focus(content.info, focus) or len(job.eyes_m) != EYES_MOST or raster is None:
@@ -54,7 +41,7 @@ def focused_job(content: ContentSource, job: Job, *, time_ns: int, focus: Focus)
     places_m = points_of_pupils(job.eyes_m)
     pictures = [view.pixels.copy() for view in job.views]
     for first in range(EYES_MOST, len(places_m), EYES_MOST):
-        views = _views(places_m[first : first + EYES_MOST], raster)
+        views = raster_views(places_m[first : first + EYES_MOST], raster)
         content.expect(views, time_ns=time_ns)
         pictures += [content.render(view, time_ns=time_ns).copy() for view in views]
     if len({picture.shape[:2] for picture in pictures}) > 1:
@@ -78,7 +65,7 @@ def _drawn_on(job: Job) -> PlaneRaster | None:
 def _is_between_panels(content: ContentSource, job: Job, raster: PlaneRaster) -> bool:
     """Return True if all content that was drawn for a job is known to lie between the outer panels."""
     rear_m, front_m = min(job.stack.x_m) - BETWEEN_M, max(job.stack.x_m) + BETWEEN_M
-    for view in _views(job.eyes_m, raster):
+    for view in raster_views(job.eyes_m, raster):
         nearness = content.nearness(view, every=block_px(job.stack.width_px), first=(0, 0))
         if nearness is None:
             return False
@@ -86,10 +73,3 @@ def _is_between_panels(content: ContentSource, job: Job, raster: PlaneRaster) ->
         if x_m.size and not (rear_m <= x_m.min() and x_m.max() <= front_m):
             return False
     return True
-
-
-def _views(eyes_m: Eyes | F64, raster: PlaneRaster) -> list[View]:
-    return [
-        View(np.asarray(eye_m), side, raster_from_stack(eye_m, raster), raster.width_px, raster.height_px)
-        for side, eye_m in enumerate(eyes_m)
-    ]

@@ -112,6 +112,16 @@ def of_colours(coded: bytes, *, primaries: int, transfer: int) -> bytes:
     return coded[:at] + struct.pack(">HH", primaries, transfer) + coded[at + 4 :]
 
 
+def make_video(
+    path: Path, colours: list[tuple[int, int, int]], size: tuple[int, int] = (160, 96), codec: str = "MJPG"
+) -> Path:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*codec), 10, size)
+    for colour in colours:
+        writer.write(np.full((size[1], size[0], 3), colour[::-1], np.uint8))
+    writer.release()
+    return path
+
+
 SAMPLES = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd", b"mp4v")  # boxes around a film's description
 
 

@@ -9,7 +9,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -25,7 +24,7 @@ from runtime.support.artifacts import write_png
 from runtime.support.picture_file import read_image, read_views
 from runtime.support.untrusted_input import LIMITS
 from tests.content.conftest import panel_view
-from tests.content.picture_files import DISPARITY, THUMBNAIL, UNDEFINED, heic_pair, mpo, swapped_profile
+from tests.content.picture_files import DISPARITY, THUMBNAIL, UNDEFINED, heic_pair, make_video, mpo, swapped_profile
 from tests.content.test_pictures import BLUE, EYES, GREEN, RED, centre, opened, solid
 
 AUTO = ContentSettings()
@@ -177,9 +176,7 @@ def test_a_stereo_header_states_the_layout(tmp_path: Path, told: tuple[int, ...]
 def test_a_film_as_wide_as_one_view_holds_two_squeezed_ones(
     tmp_path: Path, name: str, size: tuple[int, int], is_half: bool
 ) -> None:
-    writer = cv2.VideoWriter(str(tmp_path / name), cv2.VideoWriter.fourcc(*"MJPG"), 10, size)
-    writer.write(np.full((*size[::-1], 3), 90, np.uint8))
-    writer.release()
+    make_video(tmp_path / name, [(90,) * 3], size)
     assert open_frames(tmp_path / name, AUTO).layouts[0].half == is_half
 
 

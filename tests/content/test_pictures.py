@@ -22,6 +22,7 @@ from runtime.optics.views import image_from_stack
 from runtime.support.artifacts import write_png
 from tests.calls import refusal
 from tests.content.conftest import panel_view
+from tests.content.picture_files import make_video
 
 RED, GREEN, BLUE = (255, 0, 0), (0, 255, 0), (0, 0, 255)
 EYES = ((0.6, -0.03, 0.0), (0.6, 0.03, 0.0))
@@ -94,16 +95,6 @@ def test_a_folder_of_pictures_plays_and_repeats(tmp_path: Path, context: Any, st
     assert source.revision(time_ns=0) == source.revision(time_ns=99_000_000) != source.revision(time_ns=10**8)
 
 
-def make_video(
-    path: Path, colours: list[tuple[int, int, int]], size: tuple[int, int] = (160, 96), codec: str = "MJPG"
-) -> Path:
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*codec), 10, size)
-    for colour in colours:
-        writer.write(np.full((size[1], size[0], 3), colour[::-1], np.uint8))
-    writer.release()
-    return path
-
-
 def test_a_video_that_ends_repeats(tmp_path: Path, context: Any, stack: PanelStack) -> None:
     source = opened(make_video(tmp_path / "a.avi", [RED, GREEN, BLUE]), context, stack)
     seen = [centre(source, stack, 0, time_ns=tenth * 10**8) for tenth in (0, 1, 2, 3)]
@@ -138,19 +129,16 @@ def test_a_picture_too_small_for_its_views_is_one_line(
     assert refusal(opened, tmp_path / name, context, stack).startswith(f"{tmp_path / name}: {told}")
 
 
-@pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.mp4", "a.avi"])
-def test_a_truncated_file_gives_one_line_and_silent_decoders(
+@pytest.mark.parametrize("name", ["a.mp4", "a.avi"])
+def test_a_truncated_film_gives_one_line_and_silent_decoders(
     tmp_path: Path, context: Any, stack: PanelStack, name: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / name
-    if name.endswith((".mp4", ".avi")):
-        make_video(path, [RED] * 12, codec="mp4v" if name.endswith("4") else "MJPG")
-    else:
-        cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 255, (90, 160, 3), np.uint8))
+    make_video(path, [RED] * 12, codec="mp4v" if name.endswith("4") else "MJPG")
     data = path.read_bytes()
-    path.write_bytes(data[: 300 if name.endswith((".jpg", ".avi")) else len(data) // 2])
+    path.write_bytes(data[: 300 if name.endswith(".avi") else len(data) // 2])
     capfd.readouterr()
-    with pytest.raises(InputError, match=rf"{name}: cannot be decoded as an? "):
+    with pytest.raises(InputError, match=rf"{name}: cannot be decoded as a film"):
         opened(path, context, stack)
     assert capfd.readouterr().err == ""
 

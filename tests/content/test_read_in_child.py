@@ -25,9 +25,9 @@ from runtime.content.registry import prepare_content
 from runtime.optics.stack import PanelStack
 from runtime.support.artifacts import write_png
 from tests.content.conftest import panel_view
-from tests.content.picture_files import lif
+from tests.content.picture_files import lif, make_video
 from tests.content.test_eyereal import write_pair
-from tests.content.test_pictures import make_video, rgbd_picture, solid
+from tests.content.test_pictures import rgbd_picture, solid
 from tests.content.test_splat import splat_table, written
 from tests.content.test_untrusted_files import painted, png
 

@@ -33,6 +33,7 @@ from runtime.support.progress import listening
 from runtime.support.untrusted_input import LIMITS
 from tests.calls import refusal
 from tests.content.gltf_files import Buffer
+from tests.content.picture_files import make_video
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 480, 270)
 HANG_S = 30  # these once took minutes, or never ended
@@ -107,16 +108,8 @@ def test_a_folder_s_pictures_are_compared_after_exif_rotation(tmp_path: Path, ki
     assert {frames.frame(index).shape for index in range(frames.count)} == {(20, 60, 3)}
 
 
-def video(path: Path, size: tuple[int, int]) -> Path:
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 10, size)
-    for value in (10, 200):
-        writer.write(np.full((size[1], size[0], 3), value, np.uint8))
-    writer.release()
-    return path
-
-
 def test_a_large_video_is_refused_and_a_smaller_one_is_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = video(tmp_path / "a.mp4", (320, 240))
+    path = make_video(tmp_path / "a.mp4", [(10,) * 3, (200,) * 3], (320, 240), "mp4v")
     assert open_frames(path, ContentSettings()).count == 2
     monkeypatch.setattr(LIMITS, "pixels", 50_000)
     assert "320 x 240 pixels; the maximum is 50,000" in refused(path)
@@ -125,7 +118,7 @@ def test_a_large_video_is_refused_and_a_smaller_one_is_not(tmp_path: Path, monke
 @pytest.mark.parametrize("name", ["a.mp4", "a.mkv"])
 def test_a_playlist_under_a_videos_name_opens_no_other_file(tmp_path: Path, name: str) -> None:
     """FFmpeg recognises a container by its content, and a playlist names files and addresses."""
-    other = video(tmp_path / "secret.mp4", (64, 48))
+    other = make_video(tmp_path / "secret.mp4", [(10,) * 3, (200,) * 3], (64, 48), "mp4v")
     for text in (
         f"#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\n{other}\n#EXT-X-ENDLIST\n",
         f"ffconcat version 1.0\nfile {other}\n",
@@ -135,7 +128,7 @@ def test_a_playlist_under_a_videos_name_opens_no_other_file(tmp_path: Path, name
 
 
 def test_a_script_under_a_film_s_name_opens_no_other_file(tmp_path: Path) -> None:
-    other = video(tmp_path / "secret.mp4", (64, 48))
+    other = make_video(tmp_path / "secret.mp4", [(10,) * 3, (200,) * 3], (64, 48), "mp4v")
     for name, text in (("a.mp4", f"ffconcat version 1.0\nfile {other}\n"), ("concat:secret.mp4", "")):
         (tmp_path / name).write_text(text)
         with pytest.raises(InputError, match="cannot be decoded as a film"):

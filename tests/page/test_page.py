@@ -11,7 +11,7 @@ import socket
 import stat
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -257,25 +257,31 @@ def test_a_connection_that_asks_again_and_again_stays_open(page: Page, loop: Loo
     channel.close()
 
 
+def given_away(path: Path) -> None:
+    token_of(path)
+    os.chown(path, 12345, -1)
+
+
+def linked(path: Path) -> None:
+    token_of(path.with_name("aim"))
+    path.symlink_to("aim")
+
+
 @pytest.mark.parametrize(
-    ("text", "mode", "problem"),
+    ("make", "problem"),
     [
-        ("a" * 40, 0o640, "can be read by other users"),
-        ("short", 0o600, "must contain a token"),
-        ("", 0o600, "must contain a token"),
+        (lambda path: (path.write_text("a" * 40), path.chmod(0o640)), "can be read by other users"),
+        (lambda path: path.touch(0o600), "must contain a token"),
+        (lambda path: (path.touch(0o600), path.write_text("short")), "must contain a token"),
+        (Path.mkdir, "is not a regular file"),
+        (linked, "cannot be read"),
+        pytest.param(given_away, "belongs to another user", marks=pytest.mark.skipif(os.geteuid() != 0, reason="root")),
     ],
 )
-def test_a_token_file_that_is_none_is_refused(tmp_path: Path, text: str, mode: int, problem: str) -> None:
-    path = tmp_path / "token"
-    path.write_text(text)
-    path.chmod(mode)
+def test_a_token_file_that_is_none_is_refused(tmp_path: Path, make: Callable[[Path], object], problem: str) -> None:
+    make(tmp_path / "token")
     with pytest.raises(InputError, match=problem):
-        token_of(path)
-
-
-def test_a_folder_in_place_of_the_token_file_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="is not a regular file"):
-        token_of(tmp_path)
+        token_of(tmp_path / "token")
 
 
 @pytest.mark.parametrize("option", ["--config", "--port"])
@@ -286,22 +292,6 @@ def test_bad_options_are_one_line_and_exit_2(tmp_path: Path, option: str, monkey
         assert value in refusal("page", "--token-file", tmp_path / "t", option, value)
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a file away")
-def test_a_token_file_of_another_user_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "token"
-    token_of(path)
-    os.chown(path, 12345, -1)
-    with pytest.raises(InputError, match="belongs to another user"):
-        token_of(path)
-
-
 def test_a_name_that_is_not_utf_8_takes_nothing_else_away(page: Page, loop: Loop) -> None:
     loop.server.lookups["log"] = lambda: {"lines": [{"text": "\udcff.glb"}], "states": []}
     assert eventually(lambda: page.look_up("log").get("lines") == [{"text": "\udcff.glb"}])
-
-
-def test_a_link_in_the_tokens_place_is_not_followed(tmp_path: Path) -> None:
-    (tmp_path / "aim").write_text("a" * 40)
-    (tmp_path / "token").symlink_to(tmp_path / "aim")
-    with pytest.raises(InputError, match="cannot be read"):
-        token_of(tmp_path / "token")
