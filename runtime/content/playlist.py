@@ -131,6 +131,7 @@ class PlaylistSource(ForwardingSource):
             return False
         rounds, within = divmod(index, len(self._sources))
         self._begin_ns = time_ns - rounds * self._ends_ns[-1] - self._ends_ns[within]
+        self._turn_to(time_ns)
         return True
 
     def forwarded(self, view: View, time_ns: int) -> tuple[ContentSource, View, int]:

@@ -68,12 +68,12 @@ Order = ChangeSettings | Cancel | Move | Skip | Draw
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """Scene, model and device in use, which only an order changes."""
+    """Scene, model and device in use. Only an order changes them, except for `info`."""
 
     version: int  # changes with anything else below
     scene: int  # changes whenever the content is replaced or moved
     settings: Settings
-    info: ContentInfo
+    info: ContentInfo  # a playlist changes it
     model: str  # name to show
     provider: str
     reductions: tuple[int, ...]  # rasters that the model can solve on
@@ -161,6 +161,7 @@ class Stepped:
     took_ns: int
     costs: Costs
     live: Live
+    info: ContentInfo
 
 
 @dataclass(frozen=True, slots=True)

@@ -177,6 +177,8 @@ class SolverProcess(SolverHost):
         flat = self._received(update.flat, message.flat)
         self._news = taken_in(self._news, SolverUpdate(solution, flat, update.missing))
         self._costs, self._live, self._busy = message.costs, message.live, None
+        if self._known.facts is not None:  # they come after the first step
+            self._known = replace(self._known, facts=replace(self._known.facts, info=message.info))
         if message.took_ns:
             self._took_ns.append(message.took_ns)
 

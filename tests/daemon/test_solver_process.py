@@ -172,3 +172,13 @@ def test_orders_to_a_solver_that_has_ended_are_answered(rig: Rig) -> None:
     assert isinstance(drawn, Drawn) and drawn.targets is not None and drawn.targets.true is not None
     assert drawn.targets.true[0].shape == (108, 192, 3)
     assert answered(rig, Draw({"true": (eyes_m, 0)}, -1, 40.0)) == Drawn(solver._sent, None)
+
+
+def test_the_status_names_a_playlists_new_entry(tmp_path: Path) -> None:
+    shows = "".join(f'[[show]]\nscene = "{name}"\nseconds = 500\n' for name in ("flat", "grey"))
+    (tmp_path / "two.toml").write_text(shows)
+    with Rig(in_process=True, late_s=0.3, content={"scene": str(tmp_path / "two.toml")}) as rig:
+        rig.refresh_until_solved()
+        assert rig.presenter.solver.facts.info.name == "two: flat (1 of 2)"
+        rig.presenter.solver.send(Skip(rig.presenter.clock.now_ns()))
+        rig.refresh_until(lambda: rig.presenter.solver.facts.info.name == "two: grey (2 of 2)")
