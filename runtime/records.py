@@ -131,6 +131,8 @@ class PanelFrame:
     size_px: tuple[int, int] | None = None  # panel columns and rows; None: the size of `solved`
     relief: F32 | None = None  # (h, w) relief of the solution's content on the middle panel; None: unknown
     parallax: Parallax | None = None  # None: content does not move on the middle panel
+    # For each panel, `solved_from_shown` and `parallax` at the time when its own monitor shows it; empty: in step.
+    on_monitors: tuple[tuple[F64, Parallax | None], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -362,6 +362,9 @@ class PanelSettings(Section):
     gamma: Annotated[float, within(0.1, 10.0, "")] = Field(
         1.0, description="exponent of the grey curve if there is no LUT: grey = phase^(1/gamma)"
     )
+    delay_ms: Annotated[float, within(0.0, 100.0, "ms")] = Field(
+        0.0, description="how much later than `loop.scanout_ms` this panel shows a frame; its alignment allows for it"
+    )
 
 
 class OutputSettings(Section):

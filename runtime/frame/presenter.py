@@ -34,11 +34,13 @@ from runtime.optics.alignment import Alignment, align
 from runtime.optics.stack import PanelStack
 from runtime.panels.base import PanelSink
 from runtime.records import (
+    F64,
     SHOWN_STAGES,
     Effort,
     EyesEstimate,
     FrameTiming,
     PanelFrame,
+    Parallax,
     PresentReport,
     RefreshAccount,
     SensorFrame,
@@ -114,6 +116,8 @@ class Presenter:
         self._shown_solution: int | None = None  # number of the solution shown at the previous refresh
         self._drew_solution = False  # True once the panels have shown a solution
         self._aligned: tuple[int, bytes, Alignment] | None = None  # number of the solution, eyes, alignment
+        delays = [round(panel.delay_ms * NS_PER_MS) for panel in state.settings.output.panels]
+        self._delays_ns = delays if any(delays) else []  # of each panel; empty: all are in step
 
     def run(self, *, frames: int | None = None) -> str:
         """Refresh the panels until `frames`, the recording's end, or a stop, and return the reason."""
@@ -212,8 +216,25 @@ class Presenter:
             (self.stack.width_px, self.stack.height_px),
             solution.relief if solution is not None else None,
             alignment.parallax,
+            self._on_monitors(timing, solution, alignment),
         )
         return frame, alignment.limited
+
+    def _on_monitors(
+        self, timing: FrameTiming, solution: Solution | None, alignment: Alignment
+    ) -> tuple[tuple[F64, Parallax | None], ...]:
+        """Return each panel's alignment at its own display time (`PanelFrame.on_monitors`)."""
+        if not self._delays_ns or solution is None or not alignment.solved_from_shown:
+            return ()
+        found = {0: alignment}
+        for delay_ns in set(self._delays_ns) - {0}:
+            eyes = self.viewer.ahead(timing.photon_ns + delay_ns)
+            found[delay_ns] = alignment
+            if eyes.eyes_m is not None:
+                solved_for_m, eyes_m = matched(solution, eyes)
+                found[delay_ns] = align(self.stack, solved_for_m=solved_for_m, eyes_m=eyes_m)
+        chosen = [found[delay_ns] for delay_ns in self._delays_ns]
+        return tuple((each.solved_from_shown[n], each.parallax) for n, each in enumerate(chosen))
 
     def _alignment(self, eyes: EyesEstimate, solution: Solution | None) -> Alignment:
         """Align the solution to the eyes, or return its previous alignment if no eyes are known. If the layers are
@@ -374,6 +395,10 @@ def _same(frame: PanelFrame, before: PanelFrame) -> bool:
     return (
         (frame.solved_version, frame.flat_version if frame.flatness > 0.0 else 0, frame.flatness)
         == (before.solved_version, before.flat_version if before.flatness > 0.0 else 0, before.flatness)
-        and len(frame.solved_from_shown) == len(before.solved_from_shown)
-        and all(np.array_equal(a, b) for a, b in zip(frame.solved_from_shown, before.solved_from_shown, strict=True))
+        and _same_matrices(frame.solved_from_shown, before.solved_from_shown)
+        and _same_matrices([map_ for map_, _ in frame.on_monitors], [map_ for map_, _ in before.on_monitors])
     )
+
+
+def _same_matrices(some: Sequence[F64], others: Sequence[F64]) -> bool:
+    return len(some) == len(others) and all(np.array_equal(a, b) for a, b in zip(some, others, strict=True))

@@ -144,10 +144,13 @@ def panel_draws(
     by = PixelMap(solved_px[0] / size_px[0], solved_px[1] / size_px[1], 0.0, 0.0)
     for n in range(len(pictures)):
         mount = mounts[n] if mounts else None
-        aligned = scale_and_shift(frame.solved_from_shown[n]) if frame.solved_from_shown else UNMOVED
+        matrix, parallax = frame.solved_from_shown[n] if frame.solved_from_shown else None, frame.parallax
+        if mounts and frame.on_monitors:
+            matrix, parallax = frame.on_monitors[n]
+        aligned = UNMOVED if matrix is None else scale_and_shift(matrix)
         relief, moves = None, (UNMOVED, UNMOVED)
-        if frame.relief is not None and frame.parallax is not None:
-            relief, moves = frame.relief, _moves(frame.parallax, n, frame.relief, size_px, by)
+        if frame.relief is not None and parallax is not None:
+            relief, moves = frame.relief, _moves(parallax, n, frame.relief, size_px, by)
         is_exact, to_solved = mount is None or mount.is_exact, aligned.then(by)
         extended_px = int(coarse or not is_exact)
         still = aligned == UNMOVED and relief is None and not extended_px

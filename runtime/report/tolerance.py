@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from runtime.optics.carried import expected_errors
 from runtime.optics.light import LIGHT
 from runtime.optics.quality import psnr_db
 from runtime.optics.real.cells import Cell, Curve
-from runtime.optics.real.light import RealSampling, Sight, real_light
+from runtime.optics.real.light import RealLight, RealSampling, Sight, real_light
 from runtime.optics.real.panels import Lighting, Optics, Placement, RealPanels, Timing
 from runtime.optics.stack import PanelStack
 from runtime.records import U8
@@ -28,7 +28,11 @@ from runtime.report.pairs import StillPair
 PIXELS = 4000  # pixels of a picture that are measured, about; a quarter of them at displaced eyes
 PIXELS_FIRST = 600  # for the first version of the page
 SIGMA_MM = 1.0
+HEAD_M_S = 0.1  # speed of the head where time matters
 Make = Callable[[float, PanelStack], RealPanels]
+PanelMaker = Callable[[PanelStack], RealPanels]
+T = TypeVar("T")
+R = TypeVar("R")
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,21 +126,19 @@ class Bench:
     def __init__(self, subjects: Sequence[Subject]) -> None:
         self.subjects = subjects
         self.ideal_db = psnr_db(float(np.mean([subject.ideal_error for subject in subjects])))
-        self._same_rays: dict[tuple[int, int], float] = {}
+        self._same_rays: dict[tuple[int, RealSampling], float] = {}  # error of ideal panels, by subject
 
-    def light(self, make: Callable[[PanelStack], RealPanels], pixels: int) -> tuple[float, float]:
+    def light(self, make: PanelMaker, pixels: int) -> tuple[float, float]:
         """Return the light in dB on panels that `make` describes for a stack, and full white's brightness."""
         errors, brightness = [], []
         for number, subject in enumerate(self.subjects):
-            stack, sampling = subject.pair.stack, subject.sampling(pixels)
-            key = (number, pixels)
-            if key not in self._same_rays:
-                ideal = real_light(subject.layers, stack, RealPanels(), subject.sight, sampling)
-                self._same_rays[key] = ideal.error
-            panels = make(stack)
+            panels, sampling = make(subject.pair.stack), subject.sampling(pixels)
             if panels.optics.filters is not None:  # few rays pass, so trace more of them through fewer pixels
-                sampling = subject.sampling(pixels // 4)._replace(rays=8)
-            real = real_light(subject.layers, stack, panels, subject.sight, sampling)
+                sampling = subject.sampling(pixels // 3)._replace(rays=16)
+            real = self._measured(subject, panels, sampling)
+            key = (number, sampling)
+            if key not in self._same_rays:
+                self._same_rays[key] = self._measured(subject, RealPanels(), sampling).error
             errors.append(subject.ideal_error + real.error - self._same_rays[key])
             brightness.append(real.brightness)
         return psnr_db(float(np.mean(errors))), float(np.mean(brightness))
@@ -149,11 +151,16 @@ class Bench:
         """Measure each imperfection at all sizes."""
         yield from self._each(imperfections, lambda one: self._cost(one, one.sizes, PIXELS))
 
-    def _each(self, imperfections: Sequence[Imperfection], measure: Callable[[Imperfection], Cost]) -> Iterator[Cost]:
-        self.light(lambda _: RealPanels(), PIXELS_FIRST)  # fills the cache before threads share it
-        self.light(lambda _: RealPanels(), PIXELS)
+    def _measured(self, subject: Subject, panels: RealPanels, sampling: RealSampling) -> RealLight:
+        return real_light(subject.layers, subject.pair.stack, panels, subject.sight, sampling)
+
+    def lights(self, makes: Sequence[PanelMaker], pixels: int) -> Iterator[tuple[float, float]]:
+        """Yield the light and brightness of several panels, measured at the same time."""
+        yield from self._each(makes, lambda make: self.light(make, pixels))
+
+    def _each(self, items: Sequence[T], measure: Callable[[T], R]) -> Iterator[R]:
         with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-            yield from pool.map(measure, imperfections)
+            yield from pool.map(measure, items)
 
     def _cost(self, one: Imperfection, sizes: Sequence[float], pixels: int) -> Cost:
         lights: dict[float, tuple[float, float]] = {one.sizes[0]: (self.ideal_db, 1.0)}
@@ -245,8 +252,16 @@ def cell_choice(choice: float, count: int) -> RealPanels:
     return RealPanels(cells=(Cell(kinds[int(choice)]),))  # type: ignore[arg-type]
 
 
-def _late(ms: float, stack: PanelStack) -> RealPanels:
-    return RealPanels(timing=Timing(late_ms=(0.0,) * (stack.count - 1) + (ms,)))
+def late_front(ms: float, stack: PanelStack, *, allowed: bool = False, head_m_s: float = HEAD_M_S) -> RealPanels:
+    """Return panels whose front one is late. If `allowed`, the alignment allows for it."""
+    late = (0.0,) * (stack.count - 1) + (ms,)
+    return RealPanels(timing=Timing(head_m_s=head_m_s, late_ms=late, allowed_ms=late if allowed else ()))
+
+
+def slow_panels(ms: float, stack: PanelStack, *, allowed: bool = False, head_m_s: float = HEAD_M_S) -> RealPanels:
+    """Return panels of a time constant. If `allowed`, the alignment allows for their mean delay."""
+    late = (ms,) * stack.count if allowed else ()
+    return RealPanels(timing=Timing(head_m_s=head_m_s, response_ms=ms, allowed_ms=late))
 
 
 def _upside_down(share: float, stack: PanelStack) -> RealPanels:
@@ -337,12 +352,12 @@ IMPERFECTIONS = (
         lambda percent, _: RealPanels(lighting=Lighting(falloff=percent / 100)),
     ),
     Imperfection(
-        "response (time constant)", "ms", (0, 1, 2, 5, 10, 20), 2.5, 2.5, "",
-        lambda ms, _: RealPanels(timing=Timing(response_ms=ms)), "head moving at 0.1 m/s, 60 Hz",
+        "response (time constant)", "ms", (0, 1, 2, 5, 10, 20), 2.5, 2.5, "loop.scanout_ms includes it",
+        slow_panels, "head moving at 0.1 m/s, 60 Hz", partial(slow_panels, allowed=True),
     ),
     Imperfection(
-        "front panel updated late", "ms", (0, 2, 4, 8, 12, 16), 8.0, 1.0, "outputs in step (one card, same mode)",
-        _late, "head moving at 0.1 m/s, 60 Hz",
+        "front panel updated late", "ms", (0, 2, 4, 8, 12, 16), 8.0, 8.0, "delay_ms of the panel",
+        late_front, "head moving at 0.1 m/s, 60 Hz", partial(late_front, allowed=True),
     ),
     Imperfection(
         "update of a panel mounted upside down", "share of a refresh", (0, 0.25, 0.5, 0.75, 1), 0.0, 0.0, "",

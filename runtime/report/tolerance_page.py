@@ -13,6 +13,7 @@ from typing import Any
 from runtime.config import ModelSettings, load_settings
 from runtime.model.predictor import load_predictor
 from runtime.optics.quality import psnr_db
+from runtime.optics.real.cells import Cell, Curve
 from runtime.optics.real.panels import RealPanels
 from runtime.optics.stack import PanelStack
 from runtime.report.crosstalk import (
@@ -32,13 +33,18 @@ from runtime.report.tolerance import (
     PIXELS_FIRST,
     Bench,
     Cost,
+    PanelMaker,
     cell_at,
+    late_front,
+    slow_panels,
     solved,
     together,
 )
 
 SCENE, DISTANCE_M, HEIGHT_M = "room", 0.6, 0.03  # content and head position without --pairs
 BACKLIGHT_FALLOFF = 0.2
+REFRESH_MS = 1e3 / 60
+CURVES: tuple[Curve, Curve] = ("intensity", "angle")  # grey curve calibrated without and with the angles
 Progress = Callable[[str], None]
 NOTE = (
     "No real stack has been measured. The figures come from a simulator of real panels that leaves out oblique "
@@ -83,8 +89,8 @@ class ToleranceRun:
                            f"/{len(IMPERFECTIONS)})")  # fmt: skip
         pixels = PIXELS_FIRST if first else PIXELS
         self._progress("all imperfections together")
-        assumed_db, brightness = bench.light(lambda s: together(IMPERFECTIONS, s, left=False), pixels)
-        left_db, left_brightness = bench.light(lambda s: together(IMPERFECTIONS, s, left=True), pixels)
+        both = [partial(together, IMPERFECTIONS, left=left) for left in (False, True)]
+        (assumed_db, brightness), (left_db, left_brightness) = bench.lights(both, pixels)
         self.record["costs"] = [cost_entry(cost, bench.ideal_db) for cost in costs]
         self.record["together"] = {
             "assumed_db": assumed_db, "left_db": left_db,
@@ -95,20 +101,23 @@ class ToleranceRun:
 
     def _measure_compensation(self, bench: Bench) -> None:
         self._progress("compensation")
-        rows: list[dict[str, Any]] = []
-        for name, before, after in compensations():
-            lights = [bench.light(partial(_always, panels), PIXELS)[0] for panels in (before, after)]
-            rows.append({"name": name, "before_db": lights[0], "after_db": lights[1]})
+        found = compensations()
+        lights = [light for light, _ in bench.lights([make for _, *both in found for make in both], PIXELS)]
+        rows: list[dict[str, Any]] = [
+            {"name": name, "before_db": lights[2 * n], "after_db": lights[2 * n + 1]}
+            for n, (name, _, _) in enumerate(found)
+        ]
         self.record["compensation"] = rows
         shown = [(row["name"], row["before_db"], row["after_db"]) for row in rows]
         table = Table(
-            ["panels", "without the angles, dB", "with the angles, dB", "gained, dB"],
+            ["panels", "without, dB", "with, dB", "gained, dB"],
             [[name, f"{before:.2f}", f"{after:.2f}", f"{after - before:.2f}"] for name, before, after in shown],
         )
         self._sections["compensation"] = PageSection(
             "Compensation",
             ["calibrate grey takes black and full white for 0 and 90 degrees unless it is given the angles. With the "
-             "angles, every rotation within the panel's range is right."],
+             "angles, every rotation within the panel's range is right. The alignment aims at the time when each panel "
+             "shows its picture, if delay_ms of a late panel and loop.scanout_ms (with the response) are set."],
             tables=[table],
         )  # fmt: skip
         self._write()
@@ -172,24 +181,28 @@ def scene_pair(stack: PanelStack) -> StillPair:
         return painter.pair(f"{SCENE}, {DISTANCE_M:g} m", eyes_m, off_mm=())
 
 
-def _always(panels: RealPanels, _: PanelStack) -> RealPanels:
-    return panels
-
-
 def geometry(stack: PanelStack) -> dict[str, Any]:
     """Return a stack's geometry as entries for tolerance.json."""
     names = ("width_m", "height_m", "x_m", "width_px", "height_px")
     return {name: getattr(stack, name) for name in names}
 
 
-def compensations() -> list[tuple[str, RealPanels, RealPanels]]:
+def compensations() -> list[tuple[str, PanelMaker, PanelMaker]]:
     """Return compensations as name, panels before and panels after."""
-    rows = []
+    rows: list[tuple[str, PanelMaker, PanelMaker]] = []
     for white, black in ((85.0, 0.0), (80.0, 0.0), (70.0, 0.0), (90.0, 2.0), (90.0, 6.0), (80.0, 4.0)):
-        before = RealPanels(cells=(cell_at(white, black, "intensity"),))
-        after = RealPanels(cells=(cell_at(white, black, "angle"),))
+        before, after = (partial(_of_cell, cell_at(white, black, curve)) for curve in CURVES)
         rows.append((f"full white {white:g} degrees, black {black:g} degrees", before, after))
+    for name, make in ((f"front panel {REFRESH_MS:.1f} ms late", late_front), ("time constant 10 ms", slow_panels)):
+        ms = REFRESH_MS if make is late_front else 10.0
+        for speed_m_s in (0.1, 0.3):
+            before, after = (partial(make, ms, allowed=allowed, head_m_s=speed_m_s) for allowed in (False, True))
+            rows.append((f"{name}, head at {speed_m_s:g} m/s", before, after))
     return rows
+
+
+def _of_cell(cell: Cell, _: PanelStack) -> RealPanels:
+    return RealPanels(cells=(cell,))
 
 
 def cost_entry(cost: Cost, ideal_db: float) -> dict[str, Any]:

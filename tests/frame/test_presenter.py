@@ -50,6 +50,29 @@ def test_every_refresh_is_aligned_to_the_eyes_of_its_own_light(stage: Stage) -> 
     assert not np.array_equal(done.frame.solved_from_shown[0], np.eye(3))
 
 
+def test_a_late_panel_is_aligned_to_the_eyes_of_its_own_display_time() -> None:
+    speed_m_s, delays_ms = 0.2, (0.0, 4.0, 12.0)
+    stage = Stage(output={"panels": [{"delay_ms": delay_ms} for delay_ms in delays_ms]})
+    stage.solver.hand_over(solved=solution(2))
+    stage.eyes = lambda time_s: aside(speed_m_s * time_s)
+    stage.refresh(40)
+    (done,) = stage.refresh()
+    for n, (matrix, _) in enumerate(done.frame.on_monitors):
+        eyes_m = stage.viewer.ahead(done.account.predicted_for_ns + round(delays_ms[n] * NS_PER_MS)).eyes_m
+        assert eyes_m is not None
+        assert np.array_equal(matrix, align(STACK, solved_for_m=EYES, eyes_m=eyes_m).solved_from_shown[n])
+    # Closed form: seen from x = D, a panel at x = a follows the head's way v·t by v·t·a/D, and the picture moves back.
+    x_m, distance_m = STACK.x_m[-1], EYES[:, 0].mean()
+    moved_px = speed_m_s * 0.012 * x_m / distance_m / STACK.width_m * STACK.width_px
+    ahead_px = done.frame.solved_from_shown[-1][0, 2] - done.frame.on_monitors[-1][0][0, 2]
+    assert ahead_px == pytest.approx(moved_px, rel=0.05)
+    stage.eyes = lambda _: None
+    stage.refresh(HZ)
+    (done,) = stage.refresh()
+    assert len(done.frame.on_monitors) == STACK.count  # the last alignment stays
+    assert Stage().refresh()[0].frame.on_monitors == ()
+
+
 def test_a_refresh_is_aligned_from_the_eyes_of_the_solution_it_shows(stage: Stage) -> None:
     stage.eyes = moves
     stage.refresh(30)

@@ -278,6 +278,20 @@ def test_a_late_panel_shows_the_previous_frame_for_its_delay() -> None:
     assert ages == [1, 1, 0, 0]
 
 
+@pytest.mark.parametrize(("late_ms", "response_ms"), [(5.0, 0.0), (25.0, 0.0), (0.0, 4.0), (7.5, 4.0)])
+@pytest.mark.parametrize("allowed_ms", [0.0, 5.0])
+def test_a_panel_lags_by_its_delay_and_response_less_what_is_allowed_for(
+    late_ms: float, response_ms: float, allowed_ms: float
+) -> None:
+    timing = Timing(late_ms=(0, 0, late_ms), response_ms=response_ms, allowed_ms=(0, 0, allowed_ms), rate_hz=100.0)
+    lags = []
+    for state in moments(STACK, timing):
+        weights, newest = state.of(2, np.array([0.5]))
+        frames = np.arange(len(weights))
+        lags.append(float(weights[:, 0] @ (state.behind(2, newest)[0] + frames)))
+    assert np.mean(lags) * 10.0 == pytest.approx(late_ms + response_ms - allowed_ms, abs=0.1)
+
+
 def test_a_panel_mounted_upside_down_is_out_of_step_at_edges() -> None:
     timing = Timing(scan=1.0, bottom_up=(False, False, True))
     rows = np.array([0.01, 0.5, 0.99])

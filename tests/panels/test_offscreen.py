@@ -262,6 +262,23 @@ def test_content_moves_by_its_relief_as_the_reference_says(
 
 
 @BOTH
+def test_monitors_show_each_panel_aligned_for_its_own_display_time(sink: Drawn) -> None:
+    relief = np.asarray(0.15 * np.sin(np.mgrid[0:27, 0:48][1] / 8), np.float32)
+    own = [align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([0, move_m, 0])) for move_m in (0.004, 0.008, 0.016)]
+    size_px, layers = (STACK.width_px, STACK.height_px), smooth(1)
+    now, *_ = frames = [
+        PanelFrame(1, layers, 1, each.solved_from_shown, size_px=size_px, relief=relief, parallax=each.parallax)
+        for each in own
+    ]
+    in_turn = tuple((each.solved_from_shown[n], each.parallax) for n, each in enumerate(own))
+    sink.present(replace(now, on_monitors=in_turn))
+    expected = np.stack([shown_layers(frame)[n] for n, frame in enumerate(frames)])
+    every = sampled_every(sink, moved=True)
+    assert np.abs(codes(sink.read_back()) - codes(expected))[:, ::every, ::every].max() <= 3
+    assert np.array_equal(shown_layers(replace(now, on_monitors=in_turn)), shown_layers(now))  # all at one time
+
+
+@BOTH
 @pytest.mark.parametrize("reduction", [2, 4])
 @pytest.mark.parametrize("moved_m", [0.0, 0.016])
 def test_a_coarse_solution_is_enlarged_as_the_reference_does(sink: Drawn, reduction: int, moved_m: float) -> None:

@@ -13,12 +13,13 @@ from runtime.optics.carried import intensities
 from runtime.optics.pupil import PUPIL_MM
 from runtime.optics.quality import psnr_db
 from runtime.optics.real.panels import RealPanels
-from runtime.optics.real.trace import Tables, crossings, moments
+from runtime.optics.real.trace import Ints, Tables, crossings, moments
 from runtime.optics.retina import checked_eye
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_camera, stack_from_eye
 from runtime.records import F32, F64, U8, Eyes
 
+BATCH = 1 << 15  # rays traced at the same time, about; their arrays fit in a core's cache
 SETS = 2  # independent sets of rays; the squared error is the product of their errors
 
 
@@ -36,7 +37,7 @@ class Sight:
 class RealSampling(NamedTuple):
     """Choice of the rays."""
 
-    step: int = 1  # every `step`-th pixel of every `step`-th row
+    step: int = 1  # one pixel of each square of `step` by `step` pixels
     rays: int = 2  # rays across and down a pixel, in each of two sets
     pupil_mm: float = PUPIL_MM
     seed: int = 1
@@ -68,7 +69,7 @@ def real_light(layers: U8, stack: PanelStack, real: RealPanels, sight: Sight, sa
     views, whites, counted = [], np.zeros(3), 0
     for weight, move in _moves(sight):
         for eye_m, seen_from_m, target in zip(sight.eyes_m, true_m, sight.targets, strict=True):
-            eye = _Eye(eye_m, seen_from_m + move, intensities(target), sight.fov_deg)
+            eye = _Eye(eye_m, seen_from_m + move, target, sight.fov_deg)
             chosen = sampling._replace(step=2 * sampling.step) if sampling.thinned and move.any() else sampling
             view = _view(tables, eye, chosen, random, scattering)
             views.append((weight, view))
@@ -100,7 +101,7 @@ def _moves(sight: Sight) -> Iterator[tuple[float, F64]]:
 class _Eye(NamedTuple):
     solved_for_m: Eyes
     seen_from_m: F64
-    target: F32
+    target: U8 | F32
     fov_deg: float
 
 
@@ -119,13 +120,23 @@ class _View:
         return np.asarray(first * second)
 
 
+def _chosen_pixels(height: int, width: int, step: int, random: np.random.Generator) -> tuple[Ints, Ints]:
+    """Return the rows and columns of a pixel at random from each square of `step` pixels. Evenly spaced pixels would
+    meet moiré at some of its phases only.
+    """
+    corners = np.mgrid[0:height:step, 0:width:step].reshape(2, -1)
+    rows, columns = corners + (random.integers(step, size=corners.shape) if step > 1 else 0)
+    inside = (rows < height) & (columns < width)
+    return rows[inside], columns[inside]
+
+
 def _view(
     tables: Tables, eye: _Eye, sampling: RealSampling, random: np.random.Generator, scattering: np.random.Generator
 ) -> _View:
     stack, real = tables.stack, tables.real
     height, width = eye.target.shape[:2]
-    rows, columns = np.mgrid[sampling.step // 2 : height : sampling.step, sampling.step // 2 : width : sampling.step]
-    v, u = rows.ravel() + 0.5, columns.ravel() + 0.5
+    rows, columns = _chosen_pixels(height, width, sampling.step, random)
+    v, u = rows + 0.5, columns + 0.5
     checked_eye(eye.seen_from_m, stack)
     pose = stack_from_eye(checked_eye(eye.solved_for_m, stack))
     middle_x = stack.x_m[stack.count // 2]
@@ -133,33 +144,36 @@ def _view(
     lags = moments(stack, real.timing)[0]
     mask = np.ones(len(u), bool)
     lights, whites = [], []
+    corners = np.stack(np.meshgrid(np.arange(sampling.rays), np.arange(sampling.rays)), -1).reshape(-1, 2)
+    together = max(1, BATCH // max(len(u), 1))  # rays of a pixel that are traced at the same time
     for _ in range(SETS):
         light, white = np.zeros((len(u), 3), np.float32), np.zeros((len(u), 3), np.float32)
-        for down in range(sampling.rays):
-            for along in range(sampling.rays):
-                place = (np.array([along, down])[:, None] + random.random((2, len(u)))) / sampling.rays - 0.5
-                radius = sampling.pupil_mm / 2e3 * np.sqrt(random.random(len(u)))
-                angle = 2 * math.pi * random.random(len(u))
-                pupil = np.outer(radius * np.cos(angle), pose[:3, 0]) + np.outer(radius * np.sin(angle), pose[:3, 1])
-                gaze = np.stack([(u + place[0] - width / 2) / focal_px, (height / 2 - v - place[1]) / focal_px], -1)
-                gaze = gaze @ pose[:3, :2].T - pose[:3, 2]
-                through = eye.solved_for_m + gaze * ((middle_x - eye.solved_for_m[0]) / gaze[:, :1])
-                start = eye.seen_from_m + pupil
-                if not lags.is_none:
-                    late = lags.starts(0.5 - through[:, 2] / stack.height_m).min(axis=0)
-                    start = start + np.outer(late * real.timing.step_m, [0.0, 1.0, 0.0])
-                crossed = crossings(start, through, stack, real, scattering)
-                mask &= (crossed.u > 0.5).all(0) & (crossed.u < stack.width_px - 0.5).all(0)
-                mask &= (crossed.v > 0.5).all(0) & (crossed.v < stack.height_px - 0.5).all(0)
-                part, white_part = tables.light(crossed, float(eye.seen_from_m[0]))
-                light += part
-                white += white_part
+        for first in range(0, len(corners), together):
+            corner = corners[first : first + together, :, None]
+            drawn = random.random((len(corner), 4, len(u)))
+            place = (corner + drawn[:, :2]) / sampling.rays - 0.5
+            radius, angle = sampling.pupil_mm / 2e3 * np.sqrt(drawn[:, 2]).ravel(), 2 * math.pi * drawn[:, 3].ravel()
+            pupil = np.outer(radius * np.cos(angle), pose[:3, 0]) + np.outer(radius * np.sin(angle), pose[:3, 1])
+            gaze = np.stack([u + place[:, 0] - width / 2, height / 2 - v - place[:, 1]], -1).reshape(-1, 2) / focal_px
+            gaze = gaze @ pose[:3, :2].T - pose[:3, 2]
+            through = eye.solved_for_m + gaze * ((middle_x - eye.solved_for_m[0]) / gaze[:, :1])
+            start = eye.seen_from_m + pupil
+            if not lags.is_none:
+                late = lags.starts(0.5 - through[:, 2] / stack.height_m).min(axis=0)
+                start = start + np.outer(late * real.timing.step_m, [0.0, 1.0, 0.0])
+            crossed = crossings(start, through, stack, real, scattering)
+            inside = (crossed.u > 0.5).all(0) & (crossed.u < stack.width_px - 0.5).all(0)
+            inside &= (crossed.v > 0.5).all(0) & (crossed.v < stack.height_px - 0.5).all(0)
+            mask &= inside.reshape(-1, len(u)).all(0)
+            part, white_part = tables.light(crossed, float(eye.seen_from_m[0]))
+            light += part.reshape(-1, len(u), 3).sum(axis=0)
+            white += np.broadcast_to(white_part, part.shape).reshape(-1, len(u), 3).sum(axis=0)
         lights.append(light)
         whites.append(white)
     rays = np.float32(sampling.rays**2)
     return _View(
         np.stack([light / rays for light in lights])[:, mask],
         np.stack([white / rays for white in whites])[:, mask],
-        eye.target[rows.ravel(), columns.ravel()][mask],
+        intensities(eye.target[rows, columns][mask]),
         mask.astype(np.float32),
     )

@@ -64,6 +64,7 @@ class Timing:
     scan: float = 0.0  # share of a refresh that passes from the first row's update to the last row's
     bottom_up: tuple[bool, ...] = ()  # which panels are updated from the bottom row, as one mounted upside down is
     late_ms: tuple[float, ...] = ()  # how much later than the others each panel is updated
+    allowed_ms: tuple[float, ...] = ()  # delay of each panel that the alignment allows for (`delay_ms` of a panel)
 
     @property
     def step_m(self) -> float:
@@ -103,7 +104,8 @@ class RealPanels:
                 raise ValueError(f"panels.{name}: must have 1 or {count} entries, but has {length}")
         timing = self.timing
         optional = {"optics.filters": self.optics.filters, "timing.late_ms": timing.late_ms}
-        for name, entries in (optional | {"timing.bottom_up": timing.bottom_up}).items():
+        optional |= {"timing.bottom_up": timing.bottom_up, "timing.allowed_ms": timing.allowed_ms}
+        for name, entries in optional.items():
             if entries and len(entries) != count:
                 raise ValueError(f"panels.{name}: must have {count} entries, but has {len(entries)}")
 

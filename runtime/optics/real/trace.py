@@ -20,7 +20,8 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8
 
 Ints = NDArray[np.int64]
-FRAMES = 6  # latest frames that still influence a panel's state
+FRAMES = 6  # latest frames that still influence a panel's state, at most
+LEAST_WEIGHT = 1e-4  # older frames that have less weight together are left out
 MOMENTS = 4  # moments of a refresh over which light is averaged
 ORDERS = 6.0  # diffraction is drawn up to this many times the angle of a slit's first dark line
 
@@ -179,14 +180,15 @@ class Tables:
     def _panel_values(self, n: int, crossed: Crossings, lags: Lags, eye_x_m: float) -> Ints:
         width, height = self.stack.width_px, self.stack.height_px
         u, v = crossed.u[n].astype(np.float32), crossed.v[n].astype(np.float32)
-        row = np.clip(v.astype(np.int64), 0, height - 1) * width
+        row = _limited(v, height) * width
         if lags.is_none:
-            return np.asarray(STEPS * self._flat[n][row + np.clip(u.astype(np.int64), 0, width - 1)].astype(np.int64))
+            return np.asarray(STEPS * self._flat[n][row + _limited(u, width)].astype(np.int64))
         step_px = frame_step_px(self.stack, self.real.timing, n, eye_x_m)
         weights, first = lags.of(n, crossed.v[n] / height)
+        behind = lags.behind(n, first)
         total = np.zeros((len(u), 3), np.float32)
         for frame in range(weights.shape[0]):
-            column = np.clip((u + (first + frame) * step_px).astype(np.int64), 0, width - 1)
+            column = _limited(u + ((behind + frame) * step_px).astype(np.float32), width)
             total += weights[frame].astype(np.float32)[:, None] * self._flat[n][row + column]
         return np.rint(STEPS * total).astype(np.int64)
 
@@ -229,6 +231,11 @@ class Tables:
         return white
 
 
+def _limited(place: F32, count: int) -> Ints:
+    """Return the pixels that positions lie in, limited to `count` pixels."""
+    return np.minimum(np.maximum(place.astype(np.int64), 0), count - 1)
+
+
 def black_level(cells: Sequence[Cell], polarizer_contrast: float) -> float:
     """Return the light of crossed polarization, divided by that of parallel polarization. Half of what
     cells depolarize passes. Polarizers pass 1/`polarizer_contrast` when crossed.
@@ -253,9 +260,11 @@ class Lags:
         return self.timing.is_still
 
     def starts(self, row_share: F64) -> F64:
-        """Return when each panel updates rows (P,) at 0 (top) to 1, (N, P), relative to the middle row."""
+        """Return when each panel updates rows (P,) at 0 (top) to 1, (N, P), relative to the middle row. The result is
+        (N, 1) if all rows are updated at once, and so are the other methods' results.
+        """
         bottom_up = self.timing.bottom_up or (False,) * len(self.late)
-        down = self.timing.scan * (row_share - 0.5)
+        down = self.timing.scan * (row_share - 0.5) if self.timing.scan else np.zeros(1)
         return np.stack([late + (-down if up else down) for late, up in zip(self.late, bottom_up, strict=True)])
 
     def of(self, index: int, row_share: F64) -> tuple[F64, F64]:
@@ -270,8 +279,16 @@ class Lags:
         if response == 0.0:
             return np.ones((1, len(age))), newest
         fading, whole = np.exp(-age / response), math.exp(-1.0 / response)
-        weights = [1 - fading] + [fading * (1 - whole) * whole**k for k in range(FRAMES - 2)]
-        return np.stack([*weights, fading * whole ** (FRAMES - 2)]), newest
+        older = min(FRAMES - 2, math.ceil(-response * math.log(LEAST_WEIGHT)))
+        weights = [1 - fading] + [fading * (1 - whole) * whole**k for k in range(older)]
+        return np.stack([*weights, fading * whole**older]), newest
+
+    def behind(self, index: int, newest: F64) -> F64:
+        """Return how far the head is past the place that a panel's newest frames (P,) are aligned to, in refreshes. A
+        frame is aligned to the middle of the refresh that the first panel shows it, plus `allowed_ms`.
+        """
+        allowed_ms = self.timing.allowed_ms[index] if self.timing.allowed_ms else 0.0
+        return newest + self.moment - 0.5 - allowed_ms * self.timing.rate_hz / 1e3
 
 
 def moments(stack: PanelStack, timing: Timing) -> list[Lags]:
