@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from inspect import signature
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
@@ -213,6 +214,10 @@ def _plugin(name: str, file: SceneFile) -> Opener:
     Raises InputError if the class cannot be imported or the options are invalid, and so does the function for a fault.
     """
     plugin = plugin_class(name, ContentSource, field="content.scene")
+    try:
+        signature(plugin.render).bind(None, None, time_ns=0)
+    except TypeError as error:
+        raise InputError(name, "render", f"must be declared as render(self, view, *, time_ns): {error}") from None
     options = validated(strict(plugin.Options), file.settings.options, source="content.options")
 
     def make(context: Any) -> ContentSource:

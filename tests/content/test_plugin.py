@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from runtime.config import load_settings
+from runtime.config import ContentSettings, load_settings
 from runtime.content.registry import open_content
 from runtime.optics.stack import PanelStack
 from tests.calls import refusal
@@ -66,3 +66,13 @@ def test_a_wrong_one_is_one_line(
         monkeypatch.delitem(sys.modules, name, raising=False)
     settings = load_settings(tmp_path / "own.toml").content
     assert told.replace("{folder}", str(tmp_path)) in refusal(open_content, settings, stack, context)
+
+
+def test_a_render_that_takes_other_arguments_is_named(
+    tmp_path: Path, context: Any, stack: PanelStack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = "from phasestack import ContentSource\n\n\nclass Eye(ContentSource):\n    def render(self, eye, view): ...\n"
+    (tmp_path / "other_render.py").write_text(text)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    told = refusal(open_content, ContentSettings(scene="other_render:Eye"), stack, context)
+    assert "other_render:Eye: render: must be declared as render(self, view, *, time_ns): " in told

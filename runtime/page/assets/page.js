@@ -128,7 +128,7 @@ function figures(status) {
     "uptime": `${Math.floor(status.uptime_s / 3600)} h ${Math.floor((status.uptime_s % 3600) / 60)} min`,
     refreshes: `${status.presented} presented, ${status.dropped} dropped, ${status.missed_blanks} missed blanks`,
     solutions: `${status.inferences}`,
-    people: `${status.people_in_view ?? 0} in view, served: ${(status.people ?? []).map((person) => person.number).join(" and ") || "none"}`,
+    people: `${status.people_in_view ?? 0} in view, served: ${(status.people ?? []).map((person) => `person ${person.number}`).join(" and ") || "none"}`,
     sensor: `${number(status.sensor_hz)} samples/s, ${status.stale_inputs} skipped`,
     "capture to light": status.photon_ms ? `${number(status.photon_ms.p50)} ms (p50), ${number(status.photon_ms.p99)} (p99)` : "–",
     "solution age": status.solution_age_ms ? `${number(age(status.solution_age_ms.p50))} ms (p50), ${number(age(status.solution_age_ms.p99))} (p99)` : "–",
