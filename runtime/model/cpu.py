@@ -44,23 +44,32 @@ class CpuState:
 
     def __init__(self, stack: PanelStack, *, threads: int) -> None:
         self._stack, self._threads = stack, max(1, threads)
-        self._rest = rest_of(stack.count)
         self._panels: dict[int, Panels] = {}  # keyed by the number of channels
 
-    def begin(self, job: Job, geometry: Geometry, *, resumed: bool = False) -> AbstractContextManager[None]:
-        self._geometry, self._channels, self._sigma_m = geometry, job.channels, job.eye_sigma_m
-        if job.channels not in self._panels:
-            stack = self._stack
-            self._panels[job.channels] = library().Panels(stack.count, stack.height_px, stack.width_px, job.channels)
-        self._held = self._panels[job.channels]
+    def begin(self, job: Job, geometry: Geometry, *, resumed: bool = False) -> AbstractContextManager[CpuSolving]:
+        stack, channels = self._stack, job.channels
+        if channels not in self._panels:
+            self._panels[channels] = library().Panels(stack.count, stack.height_px, stack.width_px, channels)
+        return nullcontext(CpuSolving(self._panels[channels], job, geometry, threads=self._threads, resumed=resumed))
+
+    def close(self) -> None:
+        self._panels = {}
+
+
+class CpuSolving:
+    """`Solving` for the processor."""
+
+    def __init__(self, panels: Panels, job: Job, geometry: Geometry, *, threads: int, resumed: bool) -> None:
+        self._held, self._geometry, self._stack = panels, geometry, job.stack
+        self._channels, self._sigma_m, self._threads = job.channels, job.eye_sigma_m, threads
+        self._rest = rest_of(job.stack.count)
+        self._resting = set() if resumed else set(range(job.stack.count))
         seen = [view.pixels[geometry.rays.slices] for view in job.views]
         self._rays = library().Rays(
             parallel_map(lambda picture: without_alpha(picture, job.channels), seen),
             *(np.rint(TAPER * taper).astype(np.int16) for taper in geometry.tapers()),
-            _packed_table(self._stack.count), rest=self._rest, missing=geometry.missing_weight,
+            _packed_table(job.stack.count), rest=self._rest, missing=geometry.missing_weight,
         )  # fmt: skip
-        self._resting = set() if resumed else set(range(self._stack.count))
-        return nullcontext()
 
     def set_panel(self, panel: int, codes: I16) -> None:
         if self._stack.is_grey(panel) and self._channels == 3:
@@ -107,9 +116,6 @@ class CpuState:
                 held.write(n, *at, pixels, begin, end)
 
             on_rows(show, kept.height_px, threads=self._threads)
-
-    def close(self) -> None:
-        self._panels = {}
 
     def _rest_others(self) -> None:
         """Reset to the rest value all panels that have not been set."""

@@ -13,14 +13,8 @@ from runtime.optics.stack import PanelStack
 from runtime.records import I16
 
 
-class SolverState(Protocol):
-    """One stack's panels on one device, kept between frames. A state may be used by only one thread."""
-
-    def begin(self, job: Job, geometry: Geometry, *, resumed: bool = False) -> AbstractContextManager[None]:
-        """Load a job's targets, for all other methods to be called within the returned context. Until a panel
-        is set, all pixels in its box have the rest value. If `resumed`, the panels and the momentum of the previous
-        solution are kept, which must have had the same geometry.
-        """
+class Solving(Protocol):
+    """One solution that is being computed on a device, for use only within its `SolverState.begin`."""
 
     def set_panel(self, panel: int, codes: I16) -> None:
         """Set a panel's box to (rows, columns[, 3]) values in sixteenths of an 8-bit code."""
@@ -41,6 +35,16 @@ class SolverState(Protocol):
         """Write all panels to a buffer as 8-bit codes. If `outside` is None, it keeps its contents outside
         the boxes. Otherwise, `outside` is a middle-panel code, or a colour that the eyes should see there; the outer
         panels rest.
+        """
+
+
+class SolverState(Protocol):
+    """One stack's panels on one device, kept between frames. A state may be used by only one thread."""
+
+    def begin(self, job: Job, geometry: Geometry, *, resumed: bool = False) -> AbstractContextManager[Solving]:
+        """Load a job's targets, and begin a solution. Until a panel is set, all pixels in its box have the rest value.
+        If `resumed`, the panels and the momentum of the previous solution are kept, which must have had the same
+        geometry.
         """
 
     def close(self) -> None:

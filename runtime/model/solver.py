@@ -7,7 +7,7 @@ The algorithm is described in docs/mathematics.md. This module calls the operati
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from time import perf_counter_ns
 
 import cv2
@@ -19,7 +19,7 @@ from runtime.model.base import STAGES, Prediction, Predictor
 from runtime.model.buffers import LayerBuffer, LayerPool, LayerSlots
 from runtime.model.contract import Places, Step
 from runtime.model.cpu import CpuBackend
-from runtime.model.device import SolverBackend, SolverState
+from runtime.model.device import SolverBackend, SolverState, Solving
 from runtime.model.geometry import Geometry
 from runtime.model.job import Job
 from runtime.model.proposal import Proposal, tapered
@@ -27,7 +27,6 @@ from runtime.optics.malus import rest_code
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, I16
 
-_Done = tuple[int, int | None]  # number of steps, and how many of them earlier solutions made; None: not continued
 COARSE = ((8, 16), (4, 16), (2, 12))  # without a network: divisors of the first rasters, and steps on each
 COARSE_SIZE = 1.3  # size of these steps
 COARSE_LEAST_PX = 32  # minimum rows and columns of a raster
@@ -57,11 +56,20 @@ def enlarged(codes: I16, n: int, coarse: Geometry, geometry: Geometry) -> I16:
     return np.asarray(cv2.warpAffine(codes, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE), np.int16)
 
 
-def _unrounded(buffer: LayerBuffer, geometry: Geometry, state: SolverState) -> F32:
+@dataclass(frozen=True, slots=True)
+class _Improved:
+    """What `_improve` did."""
+
+    steps: int  # including those of the solutions that it continued
+    continued_from: int | None = None  # how many of these earlier solutions made; None: none was continued
+    floats: F32 | None = None  # the layers before rounding, if they were asked for
+
+
+def _unrounded(buffer: LayerBuffer, geometry: Geometry, solving: Solving) -> F32:
     """Return the layers just written to a buffer, without rounding: (N, rows, columns, 3) in [0, 1]."""
     layers = buffer.pixels[..., :3].astype(np.float32) / np.float32(255)
     for n, box in enumerate(geometry.boxes):
-        layers[n][box.slices] = state.panel(n).astype(np.float32) / np.float32(FULL)
+        layers[n][box.slices] = solving.panel(n).astype(np.float32) / np.float32(FULL)
     return layers
 
 
@@ -132,22 +140,21 @@ class StepPredictor(Predictor):
             self._pools[job.stack] = LayerPool(job.stack, self._slots)
         pool = self._pools[job.stack]
         buffer, rest, window = pool.take(), rest_code(job.stack.count), job.window
-        done: _Done = 0, None
-        floats: F32 | None = None
+        done = _Improved(0)
         if window is None:  # solve everything the eyes see, or all pixels if the network proposes whole panels
             geometry = job.targets.visible if self.any_raster else job.targets.every_pixel
             done = self._improve(job, geometry, state, buffer, watch, outside=rest)
-            floats = _unrounded(buffer, geometry, state) if job.floats else None
         else:
             if window.colour is None or not window.box.width_px:  # fill with the picture that both eyes see
                 self._improved = None
-                with state.begin(job, job.targets.visible):
-                    state.close_middle()
-                    state.write(buffer, rest)
+                with state.begin(job, job.targets.visible) as solving:
+                    solving.close_middle()
+                    solving.write(buffer, rest)
             if window.box.width_px:
                 done = self._improve(job, job.targets.within(window), state, buffer, watch, outside=window.colour)
         watch.lap("finish")
-        return Prediction(buffer.handed_over(), watch.stage_ms, job.savings, floats, *done)
+        layers = buffer.handed_over()
+        return Prediction(layers, watch.stage_ms, job.savings, done.floats, done.steps, done.continued_from)
 
     def _improve(
         self,
@@ -158,7 +165,7 @@ class StepPredictor(Predictor):
         watch: Stopwatch,
         *,
         outside: int | tuple[int, ...] | None,
-    ) -> _Done:
+    ) -> _Improved:
         """Run steps from the proposal, or the previous solution if the rays are the same, and write to `buffer`."""
         before = self._improved
         resumed = job.continued and before is not None and before[1] == job.channels and geometry.is_like(before[0])
@@ -167,20 +174,21 @@ class StepPredictor(Predictor):
         proposed: dict[int, I16] = {}
         if not resumed:
             proposed = self._proposed(job, geometry, watch)
-        with state.begin(job, geometry, resumed=resumed):
+        with state.begin(job, geometry, resumed=resumed) as solving:
             if not resumed:
-                self._begin(proposed, geometry, state)
+                self._begin(proposed, geometry, solving)
             watch.lap("finish")
             steps = self._steps if self._is_proposed(job) else self._steps_from_even
             while done < (len(steps) if job.steps is None else job.steps):
                 if job.deadline_ns is not None and perf_counter_ns() >= job.deadline_ns:
                     break
-                state.step(steps[done] if done < len(steps) else REFINING[(done - len(steps)) % len(REFINING)])
+                solving.step(steps[done] if done < len(steps) else REFINING[(done - len(steps)) % len(REFINING)])
                 done += 1
             watch.lap("step")
-            state.write(buffer, outside)
+            solving.write(buffer, outside)
+            floats = _unrounded(buffer, geometry, solving) if job.floats and job.window is None else None
         self._improved = geometry, job.channels, done
-        return done, first
+        return _Improved(done, first, floats)
 
     def _state(self, stack: PanelStack) -> SolverState:
         if stack not in self._states:
@@ -203,24 +211,24 @@ class StepPredictor(Predictor):
                 continue
             targets = job.targets.on_raster(reduction)
             coarse, state = replace(job, targets=targets, window=None), self._state(stack)
-            with state.begin(coarse, targets.visible):
+            with state.begin(coarse, targets.visible) as solving:
                 if solved is not None:
                     proposed = {n: enlarged(codes, n, solved, targets.visible) for n, codes in proposed.items()}
-                self._begin(proposed, targets.visible, state)
+                self._begin(proposed, targets.visible, solving)
                 for n in range(steps):
-                    state.step(Step(size=COARSE_SIZE, places=IN_TURN[n % len(IN_TURN)]))
-                proposed, solved = {n: state.panel(n) for n in range(stack.count)}, targets.visible
+                    solving.step(Step(size=COARSE_SIZE, places=IN_TURN[n % len(IN_TURN)]))
+                proposed, solved = {n: solving.panel(n) for n in range(stack.count)}, targets.visible
         watch.lap("step")
         if solved is None:
             return {}
         return {n: tapered(enlarged(codes, n, solved, geometry), n, geometry) for n, codes in proposed.items()}
 
-    def _begin(self, proposed: dict[int, I16], geometry: Geometry, state: SolverState) -> None:
+    def _begin(self, proposed: dict[int, I16], geometry: Geometry, solving: Solving) -> None:
         for n, codes in proposed.items():
-            state.set_panel(n, codes)
+            solving.set_panel(n, codes)
         if geometry.middle not in proposed:
-            state.close_middle()
-        state.start()
+            solving.close_middle()
+        solving.start()
 
     def close(self) -> None:
         for state in self._states.values():

@@ -105,19 +105,18 @@ def solved(case: Case, threads: int) -> list[Any]:
     job = Job(targets, channels=case.channels, eye_sigma_m=case.sigma_m)
     geometry = targets.visible if case.window is None else targets.within(case.window)
     state = CpuState(stack, threads=threads)
-    state.begin(job, geometry)
-    for n, box in enumerate(geometry.boxes):
-        if rng.random() < 0.8:
-            shape = (box.height_px, box.width_px) + ((3,) if case.channels == 3 else ())
-            state.set_panel(n, rng.integers(0, FULL + 1, shape, np.int16))
-    state.close_middle()
-    state.start()
-    for places in ("middle", "rising", "falling"):
-        state.step(Step(size=1.2, momentum=0.5, places=places))  # type: ignore[arg-type]
     buffer = LayerPool(stack).take()
-    state.write(buffer, 128)
-    boxes = enumerate(geometry.boxes)
-    return [state._held.values(n, box.height_px, box.width_px) for n, box in boxes] + [buffer.pixels]
+    with state.begin(job, geometry) as solving:
+        for n, box in enumerate(geometry.boxes):
+            if rng.random() < 0.8:
+                shape = (box.height_px, box.width_px) + ((3,) if case.channels == 3 else ())
+                solving.set_panel(n, rng.integers(0, FULL + 1, shape, np.int16))
+        solving.close_middle()
+        solving.start()
+        for places in ("middle", "rising", "falling"):
+            solving.step(Step(size=1.2, momentum=0.5, places=places))  # type: ignore[arg-type]
+        solving.write(buffer, 128)
+        return [solving.panel(n) for n in range(stack.count)] + [buffer.pixels]
 
 
 @pytest.mark.parametrize("first", range(FIRST, FIRST + EXAMPLES, BATCH))

@@ -164,11 +164,11 @@ def test_rays_in_any_order_make_the_same_panels(turn: str, channels: int) -> Non
             )
             job = replace(job, targets=replace(job.targets, views=(left, right)))
         state, geometry = cpu.CpuState(STACK, threads=2), job.targets.visible
-        state.begin(job, geometry)
-        state.close_middle()
-        state.start()
-        state.step(Step(size=1.0, places="middle"))
-        made.append(np.concatenate([panel.ravel() for panel in panels_of(state, geometry)]))
+        with state.begin(job, geometry) as solving:
+            solving.close_middle()
+            solving.start()
+            solving.step(Step(size=1.0, places="middle"))
+            made.append(np.concatenate([panel.ravel() for panel in panels_of(solving, geometry)]))
     off = np.abs(made[1] - made[0])
     assert off.mean() < 1.5 and np.quantile(off, 0.99) < 8, (off.mean(), np.quantile(off, [0.9, 0.99]))
 
@@ -237,12 +237,12 @@ def test_too_little_memory_is_an_exception() -> None:
     child = os.fork()
     if child == 0:
         state = cpu.CpuState(stack, threads=1)
-        state.begin(job, job.targets.visible)
-        state.start()
+        solving = state.begin(job, job.targets.visible).__enter__()
+        solving.start()
         used = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
         resource.setrlimit(resource.RLIMIT_AS, (used + 50_000_000, -1))
         try:
-            state.step(Step(size=1.0))
+            solving.step(Step(size=1.0))
         except MemoryError:
             os._exit(0)
         os._exit(1)

@@ -14,7 +14,7 @@ from model_export.light import Views, step
 from runtime.config import ModelSettings
 from runtime.kernels import FULL, SUBCODE
 from runtime.model.contract import Places, Step
-from runtime.model.cpu import CpuState
+from runtime.model.cpu import CpuSolving, CpuState
 from runtime.model.job import Job, Targets, drawn_job, drawn_views
 from runtime.model.predictor import load_predictor
 from runtime.model.solver import StepPredictor, steps_from_even
@@ -57,23 +57,23 @@ def smooth(seed: int, channels: int) -> U8:
 
 def begun(
     stack: PanelStack, pair: F64, *, own: bool, channels: int = 3, threads: int = 2, points: int = 1
-) -> tuple[CpuState, Job, Any]:
-    """A state with random panels, and what it was begun for."""
+) -> tuple[CpuSolving, Job, Any]:
+    """A solution with random panels, and what it was begun for."""
     pictures = [smooth(8 + seed, channels) for seed in range(len(pair))]
     views = captured_views(pictures, pair, stack, fov_deg=FOV_DEG) if own else drawn_views(pictures, stack)
     job = Job(Targets(stack, pair, views, points), channels=channels, eye_sigma_m=5e-3)
     state, geometry = CpuState(stack, threads=threads), job.targets.visible
-    state.begin(job, geometry)
-    for n, box in enumerate(geometry.boxes):
-        panel = cv2.resize(smooth(n, channels), (box.width_px, box.height_px)).astype(np.int16) * SUBCODE
-        state.set_panel(n, panel if channels == 3 else panel[..., 0])
-    state.start()
-    return state, job, geometry
+    with state.begin(job, geometry) as solving:
+        for n, box in enumerate(geometry.boxes):
+            panel = cv2.resize(smooth(n, channels), (box.width_px, box.height_px)).astype(np.int16) * SUBCODE
+            solving.set_panel(n, panel if channels == 3 else panel[..., 0])
+        solving.start()
+    return solving, job, geometry
 
 
-def panels_of(state: CpuState, geometry: Any) -> list[Any]:
+def panels_of(solving: CpuSolving, geometry: Any) -> list[Any]:
     """(rows, columns, channels) values of each panel's box."""
-    return [state._held.values(n, box.height_px, box.width_px) for n, box in enumerate(geometry.boxes)]
+    return [solving.panel(n) for n in range(len(geometry.boxes))]
 
 
 @pytest.mark.parametrize("stack", STACKS)
@@ -100,12 +100,12 @@ def compare_with_reference(
     stack: PanelStack, at: F64, own: bool, *, channels: int, many: float, points: int = 1
 ) -> None:
     count = stack.count
-    state, job, geometry = begun(stack, at, own=own, channels=channels, points=points)
+    solving, job, geometry = begun(stack, at, own=own, channels=channels, points=points)
     boxes, rays = geometry.boxes, geometry.rays
     # The reference has one size for all panels: each lies in the first corner of the largest.
     height, width = (max(getattr(box, name) for box in boxes) for name in ("height_px", "width_px"))
     last = torch.zeros(count, channels, height, width, dtype=torch.float64)
-    for n, panel in enumerate(panels_of(state, geometry)):
+    for n, panel in enumerate(panels_of(solving, geometry)):
         last[n, :, : panel.shape[0], : panel.shape[1]] = torch.from_numpy(panel.astype(np.float64) / FULL).movedim(
             -1, 0
         )
@@ -122,8 +122,8 @@ def compare_with_reference(
         views = Views(matrices, rays.width_px, rays.height_px // sets.turns, sets.views, sets.turn)
         grey = [n for n in range(count) if stack.is_grey(n)]
         last, ahead = step(last, ahead, targets, views, size=size, momentum=0.5, grey=grey)
-        state.step(Step(size=size, momentum=0.5, places=places))
-    for n, panel in enumerate(panels_of(state, geometry)):
+        solving.step(Step(size=size, momentum=0.5, places=places))
+    for n, panel in enumerate(panels_of(solving, geometry)):
         edge = 0 if alike else 8  # beside a smaller panel the reference sees what is not there
         rows, columns = slice(edge, panel.shape[0] - edge), slice(edge, panel.shape[1] - edge)
         off = np.abs(panel / FULL - last[n, :, : panel.shape[0], : panel.shape[1]].movedim(0, -1).numpy())[
@@ -142,41 +142,38 @@ def test_threads_share_a_step_without_a_trace(pair: F64, own: bool) -> None:
     for threads in (1, 3):
         before, _, _ = begun(STACK, eyes(0.9, 0.2 * threads), own=True, threads=threads)
         before.step(Step(size=1.0, places="rising"))
-        state, _, geometry = begun(TILTED, pair, own=own, threads=threads)
+        solving, _, geometry = begun(TILTED, pair, own=own, threads=threads)
         for places in ("rising", "falling"):
-            state.step(Step(size=1.6, places=places))  # type: ignore[arg-type]
-        state.close_middle()
-        found.append(panels_of(state, geometry))
+            solving.step(Step(size=1.6, places=places))  # type: ignore[arg-type]
+        solving.close_middle()
+        found.append(panels_of(solving, geometry))
     assert all((one == other).all() for one, other in zip(*found, strict=True))
 
 
 @pytest.mark.parametrize("stack", ["two", "three", "five"])
 def test_the_middle_panel_closes_on_one_eye_s_target(stack: str) -> None:
     pair = eyes(0.6)[[0, 0]]
-    state, job, geometry = begun(STACKS[stack], pair, own=False)
+    _, job, geometry = begun(STACKS[stack], pair, own=False)
     middle, count = geometry.middle, STACKS[stack].count
-    for n, box in enumerate(geometry.boxes):
-        state.set_panel(n, np.full((box.height_px, box.width_px, 3), rest_of(count), np.int16))
     same = replace(job, targets=replace(job.targets, views=(job.views[0], job.views[0])))
-    state.begin(same, geometry)
-    state.close_middle()
+    with CpuState(STACKS[stack], threads=2).begin(same, geometry) as solving:
+        solving.close_middle()
     wanted = target_table(count)[:, 0][job.views[0].pixels[geometry.rays.slices][..., :3]] - (count - 1) * rest_of(
         count
     )
-    off = np.abs(panels_of(state, geometry)[middle] - np.clip(wanted, 0, FULL))
+    off = np.abs(panels_of(solving, geometry)[middle] - np.clip(wanted, 0, FULL))
     assert np.median(off) <= 3
     assert off.max() <= 32  # of rays that miss a panel, which weigh little in 16 bits
 
 
 def test_a_ray_that_misses_a_panel_leaves_it_to_another() -> None:
-    state, job, geometry = begun(STACK, eyes(0.3), own=False)
-    for n, box in enumerate(geometry.boxes):
-        state.set_panel(n, np.full((box.height_px, box.width_px, 3), rest_of(3), np.int16))
+    _, job, geometry = begun(STACK, eyes(0.3), own=False)
     codes = 90, 160
     plain = [np.full_like(view.pixels, code) for view, code in zip(job.views, codes, strict=True)]
-    state.begin(replace(job, targets=replace(job.targets, views=drawn_views(plain, STACK))), geometry)
-    state.close_middle()
-    rays, found = geometry.rays, panels_of(state, geometry)[geometry.middle][..., 0]
+    evenly = replace(job, targets=replace(job.targets, views=drawn_views(plain, STACK)))
+    with CpuState(STACK, threads=2).begin(evenly, geometry) as solving:
+        solving.close_middle()
+    rays, found = geometry.rays, panels_of(solving, geometry)[geometry.middle][..., 0]
     at = np.stack([*np.meshgrid(np.arange(rays.width_px) + 0.5, np.arange(rays.height_px) + 0.5), np.ones(found.shape)])
     crosses = []
     for matrices in geometry.ray_sets("middle", 0.0).panels_from_rays:
@@ -192,12 +189,12 @@ def test_a_ray_that_misses_a_panel_leaves_it_to_another() -> None:
 
 
 def test_many_steps_with_momentum_do_not_diverge() -> None:
-    state, _, geometry = begun(STACK, eyes(0.6), own=True)
+    solving, _, geometry = begun(STACK, eyes(0.6), own=True)
     changes = []
     for _ in range(60):
-        before = [panel.copy() for panel in panels_of(state, geometry)]
-        state.step(Step(size=1.3, momentum=0.6))
-        after = panels_of(state, geometry)
+        before = [panel.copy() for panel in panels_of(solving, geometry)]
+        solving.step(Step(size=1.3, momentum=0.6))
+        after = panels_of(solving, geometry)
         changes.append(np.mean([np.abs(a.astype(int) - b).mean() for a, b in zip(after, before, strict=True)]))
     assert changes[-1] < 0.05 * changes[0]
 
@@ -244,14 +241,14 @@ def test_equal_grey_pictures_and_panels_that_show_them_stay() -> None:
     pair = eyes(0.6)
     grey = np.full((270, 480, 4), 128, np.uint8)
     job = drawn_job([grey, grey], pair, STACK)
-    state, geometry = CpuState(STACK, threads=1), job.targets.visible
-    state.begin(job, geometry)
-    state.close_middle()
-    state.start()
-    before = [panel.copy() for panel in panels_of(state, geometry)]
-    for _ in range(3):
-        state.step(Step(size=1.6))
-    for panel, old in zip(panels_of(state, geometry), before, strict=True):
+    geometry = job.targets.visible
+    with CpuState(STACK, threads=1).begin(job, geometry) as solving:
+        solving.close_middle()
+        solving.start()
+        before = [panel.copy() for panel in panels_of(solving, geometry)]
+        for _ in range(3):
+            solving.step(Step(size=1.6))
+    for panel, old in zip(panels_of(solving, geometry), before, strict=True):
         assert np.abs(panel.astype(int) - old).max() <= SUBCODE // 2
 
 

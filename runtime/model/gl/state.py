@@ -49,27 +49,72 @@ class GlBackend:
 
 
 class GlState:
-    """`SolverState` for OpenGL. A state may be used only by the OpenGL context's thread."""
+    """`SolverState` for OpenGL: textures that are kept between solutions. For the OpenGL context's thread only."""
 
     def __init__(self, passes: Passes, stack: PanelStack) -> None:
         """Create the state, which may share `passes`. Raises InputError if a panel is too large for the driver."""
         check_size(passes.context, stack)
-        self._passes, self._stack, self._count = passes, stack, stack.count
+        self.passes, self.stack = passes, stack
         self._textures: dict[tuple[Any, ...], Any] = {}
         self._names: dict[str, str] = {}  # which image currently has each role, for pairs of images that are swapped
+        self.ahead = "last"  # role of the panels that the next step reads
         self._closed = False
 
     @contextmanager
-    def begin(self, job: Job, geometry: Geometry, *, resumed: bool = False) -> Iterator[None]:
-        with self._passes.drawing():
-            self._geometry, self._channels, self._sigma_m = geometry, job.channels, job.eye_sigma_m
-            self._targets = [self._loaded(view, side) for side, view in enumerate(job.views)]
-            for name, taper in zip(("column_taper", "row_taper"), geometry.tapers(), strict=True):
-                self._texture(name, (self._longest, 1), 1, dtype="f4").write(taper, viewport=(0, 0, len(taper), 1))
-            rest = (rest_of(self._count) / FULL + 1) / 3
-            for n in range(0 if resumed else self._count):
-                self._passes.target((self._panel("last", n),)).clear(rest, rest, rest, rest)
-            yield
+    def begin(self, job: Job, geometry: Geometry, *, resumed: bool = False) -> Iterator[GlSolving]:
+        with self.passes.drawing():
+            yield GlSolving(self, job, geometry, resumed=resumed)
+
+    def texture(self, name: Any, size: tuple[int, int], components: int, *, dtype: str, data: Any = None) -> Any:
+        """Return the texture of this name, made at the first call."""
+        key = (name, components, dtype)
+        if key not in self._textures:
+            texture = self.passes.context.texture(size, components, data, dtype=dtype, alignment=1)
+            smooth = moderngl.LINEAR if dtype == "nu2" else moderngl.NEAREST
+            texture.filter, texture.repeat_x, texture.repeat_y = (smooth, smooth), False, False
+            self._textures[key] = texture
+        return self._textures[key]
+
+    def texture_of(self, name: str, least: tuple[int, int], components: int, *, dtype: str) -> Any:
+        """Return the texture of this name. One that is too small is replaced with a larger one."""
+        texture = self._textures.get(key := (name, components, dtype))
+        size = least
+        if texture is not None and (texture.width < least[0] or texture.height < least[1]):
+            size = max(least[0], texture.width), max(least[1], texture.height)
+            self.passes.forget(self._textures.pop(key))
+        return self.texture(name, size, components, dtype=dtype)
+
+    def panel_texture(self, role: str, n: int, components: int) -> Any:
+        """Return the texture that has a role for a panel. It is as large as the panel, so that its box can move."""
+        key = (self._names.get(f"{role} {n}", role), n)
+        return self.texture(key, (self.stack.width_px, self.stack.height_px), components, dtype="nu2")
+
+    def swap(self, one: str, other: str, n: int) -> None:
+        """Exchange the roles of two of a panel's textures."""
+        a, b = f"{one} {n}", f"{other} {n}"
+        self._names[a], self._names[b] = self._names.get(b, other), self._names.get(a, one)
+
+    def close(self) -> None:
+        if not self._closed:
+            self._closed = True
+            with suppress(Exception):  # a lost context has nothing to release
+                for texture in self._textures.values():
+                    self.passes.forget(texture)
+            self._textures = {}
+
+
+class GlSolving:
+    """`Solving` for OpenGL."""
+
+    def __init__(self, state: GlState, job: Job, geometry: Geometry, *, resumed: bool) -> None:
+        self._state, self._passes, self._stack, self._count = state, state.passes, state.stack, state.stack.count
+        self._geometry, self._channels, self._sigma_m = geometry, job.channels, job.eye_sigma_m
+        self._targets = [self._loaded(view, side) for side, view in enumerate(job.views)]
+        for name, taper in zip(("column_taper", "row_taper"), geometry.tapers(), strict=True):
+            self._taper(name).texture.write(taper, viewport=(0, 0, len(taper), 1))
+        rest = (rest_of(self._count) / FULL + 1) / 3
+        for n in range(0 if resumed else self._count):
+            self._passes.target((self._panel("last", n),)).clear(rest, rest, rest, rest)
 
     def set_panel(self, panel: int, codes: I16) -> None:
         box = self._geometry.boxes[panel]
@@ -91,7 +136,7 @@ class GlState:
 
     def close_middle(self) -> None:
         sets, middle = self._geometry.closing_sets(), self._geometry.middle
-        table = self._texture("table", (256, 1), 2, dtype="f4", data=target_table(self._count))
+        table = self._state.texture("table", (256, 1), 2, dtype="f4", data=target_table(self._count))
         inputs = {f"last{n}": self._panel("last", n) for n in range(self._count)} | {"table": Image(table, 256, 1)}
         weights = {"rest": 0.5, "missing": self._geometry.missing_weight, "middle": middle}
         fields: list[tuple[Image, Image]] = []
@@ -105,14 +150,14 @@ class GlState:
         gathered, uniforms, counts = self._gathered(fields, sets, middle)
         last = {"last": self._panel("last", middle)}
         self._passes.draw("fill", (self._panel("spare", middle),), {**last, **gathered}, uniforms, counts=counts)
-        self._swap("last", "spare", middle)
+        self._state.swap("last", "spare", middle)
 
     def start(self) -> None:
-        self._ahead = "last"  # there is no momentum yet, so the first step reads the panels themselves
+        self._state.ahead = "last"  # there is no momentum yet, so the first step reads the panels themselves
 
     def step(self, step: Step) -> None:
         sets = self._geometry.ray_sets(step.places, self._sigma_m)
-        ahead = {f"ahead{n}": self._panel(self._ahead, n) for n in range(self._count)}
+        ahead = {f"ahead{n}": self._panel(self._state.ahead, n) for n in range(self._count)}
         tapers = {name: self._taper(name) for name in ("column_taper", "row_taper")}
         fields: list[tuple[Image, Image]] = []
         for number, (view, turn, matrices) in enumerate(zip(sets.views, sets.turn, sets.panels_from_rays, strict=True)):
@@ -132,9 +177,9 @@ class GlState:
             inputs = {"ahead": ahead[f"ahead{n}"], "last": self._panel("last", n), **gathered}
             outputs = self._panel("moved", n), self._panel("spare", n)
             self._passes.draw("move", outputs, inputs, {**uniforms, **update}, counts=counts)
-            self._swap("ahead", "moved", n)
-            self._swap("last", "spare", n)
-        self._ahead = "ahead"
+            self._state.swap("ahead", "moved", n)
+            self._state.swap("last", "spare", n)
+        self._state.ahead = "ahead"
 
     def _gathered(
         self, fields: Sequence[tuple[Image, Image]], sets: RaySets, n: int
@@ -159,7 +204,7 @@ class GlState:
 
     def write(self, buffer: LayerBuffer, outside: int | tuple[int, ...] | None) -> None:
         width, height = self._stack.width_px, self._stack.height_px
-        layers = [self._texture(("layer", n), (width, height), 4, dtype="f1") for n in range(self._count)]
+        layers = [self._state.texture(("layer", n), (width, height), 4, dtype="f1") for n in range(self._count)]
         for n, texture in enumerate(layers):
             image, box = Image(texture, width, height), self._geometry.boxes[n]
             kept = self._geometry.kept if n == self._geometry.middle else box
@@ -173,14 +218,6 @@ class GlState:
                 self._passes.draw("show", (image,), inputs, place, at=(kept.u0, kept.v0, kept.width_px, kept.height_px))
         for texture, layer in zip(layers, buffer.pixels, strict=True):
             self._passes.target((Image(texture, width, height),)).read_into(layer, components=4)
-
-    def close(self) -> None:
-        if not self._closed:
-            self._closed = True
-            with suppress(Exception):  # a lost context has nothing to release
-                for texture in self._textures.values():
-                    self._passes.forget(texture)
-            self._textures = {}
 
     def _loaded(self, view: TargetView, side: int) -> tuple[Image, tuple[int, int]]:
         """Return the image of a view's target picture, uploaded if an array, and the (column, row) of its first ray."""
@@ -209,15 +246,10 @@ class GlState:
         rays = self._geometry.rays
         return max(self._stack.width_px, self._stack.height_px, rays.width_px, rays.height_px)
 
-    def _panel(self, name: str, n: int) -> Image:
-        """Return the image for a panel's box. Its texture is as large as the panel, so that the box can move."""
-        box, key = self._geometry.boxes[n], (self._names.get(f"{name} {n}", name), n)
-        size = self._stack.width_px, self._stack.height_px
-        return Image(self._texture(key, size, self._components, dtype="nu2"), box.width_px, box.height_px)
-
-    def _swap(self, one: str, other: str, n: int) -> None:
-        a, b = f"{one} {n}", f"{other} {n}"
-        self._names[a], self._names[b] = self._names.get(b, other), self._names.get(a, one)
+    def _panel(self, role: str, n: int) -> Image:
+        """Return the image for a panel's box."""
+        box = self._geometry.boxes[n]
+        return Image(self._state.panel_texture(role, n, self._components), box.width_px, box.height_px)
 
     def _rays(self, name: str, turns: int = 1) -> Image:
         """Return the image that holds one quantity for all rays in a set."""
@@ -225,26 +257,12 @@ class GlState:
         return Image(image.texture, image.width_px, image.height_px // turns)
 
     def _taper(self, name: str) -> Image:
-        return Image(self._texture(name, (self._longest, 1), 1, dtype="f4"), self._longest, 1)
+        return Image(self._state.texture(name, (self._longest, 1), 1, dtype="f4"), self._longest, 1)
 
     def _ray_image(self, name: str, components: int, dtype: str) -> Image:
-        """Return an image with one pixel per ray. A texture that is too small is replaced with a larger one."""
-        width_px, height_px = self._geometry.rays.width_px, self._geometry.rays.height_px
-        size = width_px, height_px
-        texture = self._textures.get(key := (name, components, dtype))
-        if texture is not None and (texture.width < width_px or texture.height < height_px):
-            size = max(width_px, texture.width), max(height_px, texture.height)
-            self._passes.forget(self._textures.pop(key))
-        return Image(self._texture(name, size, components, dtype=dtype), width_px, height_px)
-
-    def _texture(self, name: Any, size: tuple[int, int], components: int, *, dtype: str, data: Any = None) -> Any:
-        key = (name, components, dtype)
-        if key not in self._textures:
-            texture = self._passes.context.texture(size, components, data, dtype=dtype, alignment=1)
-            smooth = moderngl.LINEAR if dtype == "nu2" else moderngl.NEAREST
-            texture.filter, texture.repeat_x, texture.repeat_y = (smooth, smooth), False, False
-            self._textures[key] = texture
-        return self._textures[key]
+        """Return an image with one pixel per ray."""
+        size = self._geometry.rays.width_px, self._geometry.rays.height_px
+        return Image(self._state.texture_of(name, size, components, dtype=dtype), *size)
 
 
 def check_size(context: moderngl.Context, stack: PanelStack) -> None:
