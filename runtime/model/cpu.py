@@ -46,18 +46,18 @@ class CpuState:
         self._stack, self._threads = stack, max(1, threads)
         self._panels: dict[int, Panels] = {}  # keyed by the number of channels
 
-    def begin(self, job: Job, geometry: Geometry, *, resumed: bool = False) -> AbstractContextManager[CpuSolving]:
+    def begin(self, job: Job, geometry: Geometry, *, resumed: bool = False) -> AbstractContextManager[CpuSolution]:
         stack, channels = self._stack, job.channels
         if channels not in self._panels:
             self._panels[channels] = library().Panels(stack.count, stack.height_px, stack.width_px, channels)
-        return nullcontext(CpuSolving(self._panels[channels], job, geometry, threads=self._threads, resumed=resumed))
+        return nullcontext(CpuSolution(self._panels[channels], job, geometry, threads=self._threads, resumed=resumed))
 
     def close(self) -> None:
         self._panels = {}
 
 
-class CpuSolving:
-    """`Solving` for the processor."""
+class CpuSolution:
+    """`OpenSolution` for the processor."""
 
     def __init__(self, panels: Panels, job: Job, geometry: Geometry, *, threads: int, resumed: bool) -> None:
         self._held, self._geometry, self._stack = panels, geometry, job.stack

@@ -13,7 +13,7 @@ from runtime.optics.stack import PanelStack
 from runtime.records import I16
 
 
-class Solving(Protocol):
+class OpenSolution(Protocol):
     """One solution that is being computed on a device, for use only within its `SolverState.begin`."""
 
     def set_panel(self, panel: int, codes: I16) -> None:
@@ -41,7 +41,7 @@ class Solving(Protocol):
 class SolverState(Protocol):
     """One stack's panels on one device, kept between frames. A state may be used by only one thread."""
 
-    def begin(self, job: Job, geometry: Geometry, *, resumed: bool = False) -> AbstractContextManager[Solving]:
+    def begin(self, job: Job, geometry: Geometry, *, resumed: bool = False) -> AbstractContextManager[OpenSolution]:
         """Load a job's targets, and begin a solution. Until a panel is set, all pixels in its box have the rest value.
         If `resumed`, the panels and the momentum of the previous solution are kept, which must have had the same
         geometry.

@@ -19,7 +19,7 @@ from runtime.model.base import STAGES, Prediction, Predictor
 from runtime.model.buffers import LayerBuffer, LayerPool, LayerSlots
 from runtime.model.contract import Places, Step
 from runtime.model.cpu import CpuBackend
-from runtime.model.device import SolverBackend, SolverState, Solving
+from runtime.model.device import OpenSolution, SolverBackend, SolverState
 from runtime.model.geometry import Geometry
 from runtime.model.job import Job
 from runtime.model.proposal import Proposal, tapered
@@ -58,14 +58,14 @@ def enlarged(codes: I16, n: int, coarse: Geometry, geometry: Geometry) -> I16:
 
 @dataclass(frozen=True, slots=True)
 class _Improved:
-    """What `_improve` did."""
+    """Outcome of `_improve`."""
 
     steps: int  # including those of the solutions that it continued
     continued_from: int | None = None  # how many of these earlier solutions made; None: none was continued
     floats: F32 | None = None  # the layers before rounding, if they were asked for
 
 
-def _unrounded(buffer: LayerBuffer, geometry: Geometry, solving: Solving) -> F32:
+def _unrounded(buffer: LayerBuffer, geometry: Geometry, solving: OpenSolution) -> F32:
     """Return the layers just written to a buffer, without rounding: (N, rows, columns, 3) in [0, 1]."""
     layers = buffer.pixels[..., :3].astype(np.float32) / np.float32(255)
     for n, box in enumerate(geometry.boxes):
@@ -223,7 +223,7 @@ class StepPredictor(Predictor):
             return {}
         return {n: tapered(enlarged(codes, n, solved, geometry), n, geometry) for n, codes in proposed.items()}
 
-    def _begin(self, proposed: dict[int, I16], geometry: Geometry, solving: Solving) -> None:
+    def _begin(self, proposed: dict[int, I16], geometry: Geometry, solving: OpenSolution) -> None:
         for n, codes in proposed.items():
             solving.set_panel(n, codes)
         if geometry.middle not in proposed:

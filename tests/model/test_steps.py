@@ -14,7 +14,7 @@ from model_export.light import Views, step
 from runtime.config import ModelSettings
 from runtime.kernels import FULL, SUBCODE
 from runtime.model.contract import Places, Step
-from runtime.model.cpu import CpuSolving, CpuState
+from runtime.model.cpu import CpuSolution, CpuState
 from runtime.model.job import Job, Targets, drawn_job, drawn_views
 from runtime.model.predictor import load_predictor
 from runtime.model.solver import StepPredictor, steps_from_even
@@ -57,7 +57,7 @@ def smooth(seed: int, channels: int) -> U8:
 
 def begun(
     stack: PanelStack, pair: F64, *, own: bool, channels: int = 3, threads: int = 2, points: int = 1
-) -> tuple[CpuSolving, Job, Any]:
+) -> tuple[CpuSolution, Job, Any]:
     """A solution with random panels, and what it was begun for."""
     pictures = [smooth(8 + seed, channels) for seed in range(len(pair))]
     views = captured_views(pictures, pair, stack, fov_deg=FOV_DEG) if own else drawn_views(pictures, stack)
@@ -71,7 +71,7 @@ def begun(
     return solving, job, geometry
 
 
-def panels_of(solving: CpuSolving, geometry: Any) -> list[Any]:
+def panels_of(solving: CpuSolution, geometry: Any) -> list[Any]:
     """(rows, columns, channels) values of each panel's box."""
     return [solving.panel(n) for n in range(len(geometry.boxes))]
 

@@ -61,9 +61,9 @@ class GlState:
         self._closed = False
 
     @contextmanager
-    def begin(self, job: Job, geometry: Geometry, *, resumed: bool = False) -> Iterator[GlSolving]:
+    def begin(self, job: Job, geometry: Geometry, *, resumed: bool = False) -> Iterator[GlSolution]:
         with self.passes.drawing():
-            yield GlSolving(self, job, geometry, resumed=resumed)
+            yield GlSolution(self, job, geometry, resumed=resumed)
 
     def texture(self, name: Any, size: tuple[int, int], components: int, *, dtype: str, data: Any = None) -> Any:
         """Return the texture of this name, made at the first call."""
@@ -103,8 +103,8 @@ class GlState:
             self._textures = {}
 
 
-class GlSolving:
-    """`Solving` for OpenGL."""
+class GlSolution:
+    """`OpenSolution` for OpenGL."""
 
     def __init__(self, state: GlState, job: Job, geometry: Geometry, *, resumed: bool) -> None:
         self._state, self._passes, self._stack, self._count = state, state.passes, state.stack, state.stack.count
