@@ -40,8 +40,14 @@ def picture(shift_px: int = 0) -> np.ndarray:
     return np.roll(cv2.resize(coarse, (320, 180), interpolation=cv2.INTER_CUBIC), shift_px, axis=1)
 
 
+def solution(left: Any = None, right: Any = None, **how: Any) -> phasestack.Result:
+    """What `fast` makes of the pictures, of a pair that it can show if there are none."""
+    pair = (picture(), picture(3)) if left is None else (left, right)
+    return phasestack.solve(*pair, **{"eyes_m": EYES, "stack": STACK, "model": "fast"} | how)
+
+
 def test_a_pair_becomes_layers_eye_views_and_quality(tmp_path: Path) -> None:
-    result = phasestack.solve(picture(), picture(3), eyes_m=EYES, stack=STACK, fov_deg=40, model="fast")
+    result = solution(fov_deg=40)
     assert result.layers.shape == (3, 180, 320, 3) and result.layers.dtype == np.uint8
     assert result.seen.shape == (2, 180, 320, 3) and result.seen.dtype == np.uint8
     light_db = result.quality.light_db
@@ -55,15 +61,15 @@ def test_a_pair_becomes_layers_eye_views_and_quality(tmp_path: Path) -> None:
 def test_a_process_forked_during_a_solution_solves() -> None:
     """The child waited for the thread of its parent to finish."""
     stack = replace(STACK, width_px=64, height_px=36)
-    small: Any = (picture()[:36, :64], picture(3)[:36, :64])
+    small = (picture()[:36, :64], picture(3)[:36, :64])
     ended = threading.Event()
 
     def keep_solving() -> None:
         while not ended.is_set():
-            phasestack.solve(*small, eyes_m=EYES, stack=stack, model="fast")
+            solution(*small, stack=stack)
 
     thread = threading.Thread(target=keep_solving)
-    phasestack.solve(*small, eyes_m=EYES, stack=stack, model="fast")
+    solution(*small, stack=stack)
     thread.start()
     try:
         for _ in range(3):
@@ -72,7 +78,7 @@ def test_a_process_forked_during_a_solution_solves() -> None:
                 signal.signal(signal.SIGALRM, signal.SIG_DFL)
                 signal.alarm(60)
                 try:
-                    phasestack.solve(*small, eyes_m=EYES, stack=stack, model="fast")
+                    solution(*small, stack=stack)
                     os._exit(0)
                 finally:
                     os._exit(1)
@@ -92,17 +98,15 @@ def test_a_process_forked_during_a_solution_solves() -> None:
     ],
 )
 def test_what_is_no_folder_is_refused_by_name(out: Any, said: str) -> None:
-    small: Any = picture()[:36, :64]
-    stack = replace(STACK, width_px=64, height_px=36)
+    result = solution(picture()[:36, :64], picture()[:36, :64], stack=replace(STACK, width_px=64, height_px=36))
     with pytest.raises(ValueError, match=said):
-        phasestack.solve(small, small, eyes_m=EYES, stack=stack, model="fast").save(out)
+        result.save(out)
 
 
 def test_light_of_a_large_picture_is_of_some_pixels_with_its_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    given: Any = (picture(), picture(3))
-    whole = phasestack.solve(*given, eyes_m=EYES, stack=STACK, model="fast").quality
+    whole = solution().quality
     monkeypatch.setattr(solved, "WHOLE_PX", 1000)
-    some = phasestack.solve(*given, eyes_m=EYES, stack=STACK, model="fast").quality
+    some = solution().quality
     for sigma, error_db in some.standard_error_db.items():
         assert 0 < error_db < 1 and abs(some.light_db[sigma] - whole.light_db[sigma]) < 4 * error_db
     assert not whole.standard_error_db and (some.psnr_db, some.ssim) == (whole.psnr_db, whole.ssim)
@@ -121,11 +125,11 @@ def test_it_is_what_the_command_makes(tmp_path: Path) -> None:
 
 
 def test_pictures_are_codes_or_intensities_with_or_without_transparency() -> None:
-    codes = phasestack.solve(picture(), picture(3), eyes_m=EYES, stack=STACK, model="fast").layers
+    codes = solution().layers
     floats = [picture(shift) / 255 for shift in (0, 3)]
-    assert np.array_equal(phasestack.solve(*floats, eyes_m=EYES, stack=STACK, model="fast").layers, codes)
+    assert np.array_equal(solution(*floats).layers, codes)
     opaque = [np.dstack([picture(shift), np.full((180, 320), 255, np.uint8)]) for shift in (0, 3)]
-    assert np.array_equal(phasestack.solve(*opaque, eyes_m=EYES, stack=STACK, model="fast").layers, codes)
+    assert np.array_equal(solution(*opaque).layers, codes)
 
 
 @pytest.mark.parametrize(
@@ -152,6 +156,16 @@ def test_pictures_are_codes_or_intensities_with_or_without_transparency() -> Non
         ({"fov_deg": 190.0}, "fov_deg"),
         ({"eye_sigma_mm": float("nan")}, "eye_sigma_mm"),
         ({"model": "fats"}, "^model: name: 'fats' is not a model"),  # `model` once
+        ({"left": [picture()] * 3, "right": None}, "eyes_m: must be 3 points"),
+        (
+            {"left": [picture(), picture()[:90]], "right": None},
+            r"pictures\[1\]: must have the same shape as pictures\[0\]",
+        ),
+        ({"left": [], "right": None}, "pictures: must be a sequence of 1 to 8"),
+        ({"right": None}, "right: is required"),
+        ({"left": [picture()] * 3, "right": None, "eyes_m": (*EYES, EYES[0])}, "eyes_m: the eyes are 0 mm apart"),
+        *(({"steps": steps}, "steps: must be a whole number from 0 to 1000") for steps in (-1, 1.5, True, "2", 1001)),
+        ({"floats": 1}, "^floats: must be True or False"),
     ],
 )
 def test_what_does_not_fit_is_a_value_error_that_names_the_argument(change: dict[str, Any], argument: str) -> None:
@@ -225,7 +239,7 @@ def test_a_result_prints_in_a_line_and_measures_quality_when_asked(monkeypatch: 
     calls = []
     real = solved.displayed
     monkeypatch.setattr(solved, "displayed", lambda *given, **how: calls.append(1) or real(*given, **how))
-    result = phasestack.solve(picture(), picture(3), eyes_m=EYES, stack=STACK, model="fast")
+    result = solution()
     assert repr(result) == "<phasestack.Result: 3 layers of 320x180 by fast>" and calls == []
     assert result.quality is result.quality and calls == [1]
     assert phasestack.__version__[0].isdigit()
@@ -273,11 +287,10 @@ def test_pictures_of_parallel_cameras_are_solved_for_what_they_are() -> None:
 
 def test_cameras_that_look_at_the_middle_are_what_is_meant_without_them() -> None:
     cameras = [phasestack.camera(eye, width_px=320, height_px=180) for eye in EYES]
-    without = phasestack.solve(picture(), picture(3), eyes_m=EYES, stack=STACK, model="fast")
+    without = solution()
     scaled = [-3 * matrix for matrix in cameras]
     for given in (cameras, scaled):
-        result = phasestack.solve(picture(), picture(3), cameras=given, stack=STACK, model="fast")
-        assert np.array_equal(result.layers, without.layers)
+        assert np.array_equal(solution(cameras=given, eyes_m=None).layers, without.layers)
     points = np.array([[0.0, 0.0, 0.0], [0.0, 0.1, 0.05], [2.0, 0.0, 0.0]])
     pixels = phasestack.project(points, eye_m=EYES[0], width_px=320, height_px=180)
     assert np.allclose(pixels[0], (160, 90)) and pixels[1, 0] > 160 > 0 and np.isnan(pixels[2]).all()
@@ -290,7 +303,7 @@ def test_a_camera_s_size_is_whole_pixels(given: dict[str, Any]) -> None:
 
 
 def test_anybody_s_layers_are_evaluated_as_ours_are() -> None:
-    result = phasestack.solve(picture(), picture(3), eyes_m=EYES, stack=STACK, model="fast")
+    result = solution()
     how: dict[str, Any] = {"eyes_m": EYES, "stack": STACK}
     assert phasestack.evaluate(result.layers, picture(), picture(3), **how) == result.quality
     assert phasestack.evaluate(result.layers / 255, picture(), picture(3), **how) == result.quality
@@ -364,11 +377,13 @@ def test_the_example_pair_shows_its_scene_and_is_a_case(tmp_path: Path) -> None:
     assert np.array_equal(case.images[1], pair.right) and np.array_equal(case.eyes_m, pair.eyes_m)
 
 
+PAIR = phasestack.example_pair()
+SHOWN: dict[str, Any] = {"eyes_m": PAIR.eyes_m, "stack": PAIR.stack, "fov_deg": PAIR.fov_deg}
+
+
 def test_quality_at_a_chosen_price_says_how_exact_it_is() -> None:
-    pair = phasestack.example_pair()
-    how: Any = {"eyes_m": pair.eyes_m, "stack": pair.stack, "fov_deg": pair.fov_deg}
-    result = phasestack.solve(pair.left, pair.right, model="fast", **how)
-    whole = phasestack.evaluate(result.layers, pair.left, pair.right, sigmas_mm=(1,), **how)
+    result = solution(PAIR.left, PAIR.right, **SHOWN)
+    whole = phasestack.evaluate(result.layers, PAIR.left, PAIR.right, sigmas_mm=(1,), **SHOWN)
     exact_db: float = whole.light_db["1"]
     assert set(whole.light_db) == set(whole.expected_db) == {"1"} and whole.standard_error_db == {}
     assert exact_db == pytest.approx(result.quality.light_db["1"], abs=0.01)
@@ -389,8 +404,7 @@ def test_many_pairs_are_solved_in_turn() -> None:
     places = [np.add(EYES, (0.0, 0.02 * k, 0.0)) for k in range(3)]
     pairs = ((picture(), picture(3), eyes) for eyes in places)  # drawn as they are needed
     results = list(phasestack.solve_each(pairs, stack=STACK, model="fast"))
-    alone = phasestack.solve(picture(), picture(3), eyes_m=places[2], stack=STACK, model="fast")
-    assert len(results) == 3 and np.array_equal(results[2].layers, alone.layers)
+    assert len(results) == 3 and np.array_equal(results[2].layers, solution(eyes_m=places[2]).layers)
     with pytest.raises(ValueError, match=r"pairs\[1\]: eyes_m"):
         list(phasestack.solve_each([(picture(), picture(3), EYES), (picture(), picture(3), ())], stack=STACK))
 
@@ -439,22 +453,6 @@ def test_a_panel_without_filters_has_one_value_for_all_colours() -> None:
     pictures = [card_scene(np.array(eye), width_px=320, height_px=180) for eye in EYES]
     layers = phasestack.solve(*pictures, eyes_m=EYES, stack=stack).layers
     assert (np.ptp(layers[2], axis=-1) == 0).all() and np.ptp(layers[0], axis=-1).max() > 50
-
-
-@pytest.mark.parametrize(
-    ("given", "told"),
-    [
-        ({"left": [picture()] * 3}, "eyes_m: must be 3 points"),
-        ({"left": [picture(), picture()[:90]]}, r"pictures\[1\]: must have the same shape as pictures\[0\]"),
-        ({"left": []}, "pictures: must be a sequence of 1 to 8"),
-        ({"left": picture()}, "right: is required"),
-        ({"left": [picture()] * 3, "eyes_m": (*EYES, EYES[0])}, "eyes_m: the eyes are 0 mm apart"),
-    ],
-)
-def test_views_that_do_not_fit_are_refused(given: dict[str, Any], told: str) -> None:
-    arguments: dict[str, Any] = {"eyes_m": EYES, "stack": STACK, **given}
-    with pytest.raises(ValueError, match=told):
-        phasestack.solve(arguments.pop("left"), **arguments)
 
 
 def rectified(shift_px: int, levels: Sequence[int] = (30, 90, 160, 230)) -> tuple[np.ndarray, ...]:
@@ -553,8 +551,7 @@ def test_tensors_that_need_gradients_are_taken_as_numbers() -> None:
     assert np.allclose([phasestack.camera(eye, **sizes) for eye in eyes], expected, atol=1e-3)
     middle = phasestack.project(torch.zeros(3, requires_grad=True), eye_m=eyes[0], **sizes)
     assert middle == pytest.approx([160, 90])
-    solved = phasestack.solve(picture(), picture(3), eyes_m=list(eyes), stack=STACK, model="fast")
-    assert solved.layers.shape[0] == 3
+    assert solution(eyes_m=list(eyes)).layers.shape[0] == 3
     for name, call in (("eye_m", phasestack.camera), ("points_m", phasestack.project)):
         with pytest.raises(ValueError, match=f"^{name}: must be"):
             call("abc", **sizes, **({} if name == "eye_m" else {"eye_m": EYES[0]}))  # type: ignore[operator]
@@ -580,34 +577,20 @@ def test_without_stderr_pairs_are_solved_and_a_file_as_folder_is_named(
 
 @pytest.mark.parametrize("model", ["fast", "sart"])
 def test_more_steps_serve_the_eyes_better(model: str) -> None:
-    pair = phasestack.example_pair()
-
-    def light_db(steps: int | None) -> float:
-        how: Any = {} if steps is None else {"steps": steps}
-        result = phasestack.solve(
-            pair.left, pair.right, eyes_m=pair.eyes_m, stack=pair.stack, fov_deg=pair.fov_deg, model=model, **how
-        )
+    def light_db(**how: int) -> float:
+        result = solution(PAIR.left, PAIR.right, **SHOWN, model=model, **how)
         return result.measure(sigmas_mm=(1,), every=8).light_db["1"]
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # one step leaves ghosts
-        assert light_db(1) + 0.5 < light_db(6)
-    assert light_db(None) > 25
-
-
-@pytest.mark.parametrize("steps", [-1, 1.5, True, "2", 1001])
-def test_steps_that_are_none_are_refused(steps: Any) -> None:
-    pair = phasestack.example_pair()
-    with pytest.raises(ValueError, match="steps: must be a whole number from 0 to 1000"):
-        phasestack.solve(pair.left, pair.right, eyes_m=pair.eyes_m, stack=pair.stack, steps=steps)
+        assert light_db(steps=1) + 0.5 < light_db(steps=6)
+    assert light_db() > 25
 
 
 @pytest.mark.parametrize("model", ["fast", "sart"])
 def test_float_layers_are_the_layers_before_rounding(model: str, tmp_path: Path) -> None:
-    pair = phasestack.example_pair()
-    how: Any = {"eyes_m": pair.eyes_m, "stack": pair.stack, "fov_deg": pair.fov_deg, "model": model}
-    assert phasestack.solve(pair.left, pair.right, **how).floats is None
-    result = phasestack.solve(pair.left, pair.right, floats=True, **how)
+    assert solution(PAIR.left, PAIR.right, **SHOWN, model=model).floats is None
+    result = solution(PAIR.left, PAIR.right, **SHOWN, model=model, floats=True)
     assert result.floats is not None and result.floats.dtype == np.float32
     exact = result.floats.astype(float) * 255
     assert exact.min() >= 0 and exact.max() <= 255
@@ -616,17 +599,9 @@ def test_float_layers_are_the_layers_before_rounding(model: str, tmp_path: Path)
     assert (np.load(tmp_path / "layers.npy") == result.floats).all()
 
 
-def test_floats_must_be_true_or_false() -> None:
-    pair = phasestack.example_pair()
-    with pytest.raises(ValueError, match=r"^floats: must be True or False"):
-        phasestack.solve(pair.left, pair.right, eyes_m=pair.eyes_m, stack=pair.stack, floats=1)  # type: ignore[arg-type]
-
-
 def test_obvious_ghosts_are_noted() -> None:
-    rng, (height, width) = np.random.default_rng(1), (180, 320)
-    noise = [rng.integers(0, 256, (height, width, 3)).astype(np.uint8) for _ in range(2)]
-    stack = phasestack.Stack(0.5184, 0.2916, (-0.06, 0.0, 0.06), width_px=width, height_px=height)
-    result = phasestack.solve(*noise, eyes_m=((0.6, -0.03, 0), (0.6, 0.03, 0)), stack=stack, model="fast")
+    noise = np.random.default_rng(1).integers(0, 256, (2, 180, 320, 3)).astype(np.uint8)
+    result = solution(*noise, eyes_m=((0.6, -0.03, 0), (0.6, 0.03, 0)))
     assert result.quality.light_db["1"] < 21 and any("obvious ghosts: light is" in note for note in result.notes)
 
 
