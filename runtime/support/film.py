@@ -40,7 +40,7 @@ STREAM_OPTIONS = {
 }
 ANSWERS_IN_S = 5.0  # longest wait for a network camera's answer or next picture
 REASONS = {  # why a network camera cannot be opened
-    av.error.HTTPUnauthorizedError: "asks for a password; set sensor.source to rtsp://user:password@host/path",
+    av.error.HTTPUnauthorizedError: "asks for a password; write user:password@ before the host in sensor.source",
     av.error.HTTPForbiddenError: "refuses this user; correct the user name and password in sensor.source",
     av.error.HTTPNotFoundError: "has no stream of this name (404); correct the path in sensor.source",
     av.error.ConnectionRefusedError: "refuses connections; switch the camera on, or correct sensor.source",

@@ -102,7 +102,7 @@ def test_a_network_cameras_pictures_are_read(server: int) -> None:
 @pytest.mark.parametrize(
     ("path", "told"),
     [
-        ("private", "asks for a password"),
+        ("private", "asks for a password; write user:password@ before the host in sensor.source"),
         ("banned", "refuses this user"),
         ("gone", "has no stream of this name"),
         ("text", "sends no pictures"),
