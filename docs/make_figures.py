@@ -96,15 +96,15 @@ def optics() -> Figure:
 
 
 def architecture() -> Figure:
-    """Draw a diagram of the threads and the data they exchange."""
+    """Draw a diagram of the processes and the data they exchange."""
     figure = Figure(figsize=(11, 5.6), layout="constrained")
     axes = blank(figure, 111, (0, 22), (0, 11))
-    threads = (
-        (0.2, 7.3, 21.6, 3.1, "#eef4fb", "sensor thread"),
-        (0.2, 3.9, 21.6, 3.1, "#fdf1e7", "presenter: the display's clock, one refresh after another"),
-        (0.2, 0.5, 21.6, 3.1, "#eef8ee", "solver's process: as fast as the machine is"),
+    processes = (
+        (0.2, 7.3, 21.6, 3.1, "#eef4fb", "sensor's process"),
+        (0.2, 3.9, 21.6, 3.1, "#fdf1e7", "presenter's process: the display's clock, one refresh after another"),
+        (0.2, 0.5, 21.6, 3.1, "#eef8ee", "solver's process: at its own pace"),
     )
-    for x, y, width, height, colour, name in threads:
+    for x, y, width, height, colour, name in processes:
         axes.add_patch(
             FancyBboxPatch((x, y), width, height, boxstyle="round,pad=0,rounding_size=0.2", fc=colour, ec="none")
         )
