@@ -58,7 +58,8 @@ class Shown:
 
 
 class BrowserLink:
-    """Latest values that the refresh loop and all pages that show the display exchange. Each is replaced as a whole.
+    """Latest values that the refresh loop and all pages that show the display exchange.
+    Each is replaced as a whole.
     Thread-safe. The page that has been connected longest is the viewer: only its samples or camera pictures are used,
     and all other pages just watch.
     """
@@ -76,7 +77,9 @@ class BrowserLink:
         self._captures: deque[tuple[int, float]] = deque(maxlen=CAPTURES_MAX)
 
     def join(self, page: object, notify: Callable[[], None]) -> bool:
-        """Connect a page, which is notified of changes on any thread. Returns False if too many are connected."""
+        """Connect a page, which is notified of changes on any thread.
+        Returns False if too many are connected.
+        """
         if len(self._pages) >= PAGES_MAX:
             return False
         self._pages[page] = notify

@@ -42,7 +42,9 @@ class ShownViews:
         self._warped: dict[int, WarpedPicture] = {}
 
     def from_view(self, view: View) -> F64 | None:
-        """Return the 3x3 homography from an eye's view to the views' pixels, or None if the eye is in their plane."""
+        """Return the 3x3 homography from an eye's view to the views' pixels, or None if the eye is in
+        their plane.
+        """
         return plane_from_pixels(view.pixels_from_stack, self.screen)
 
     def warped(self, number: int, picture_from_view: F64 | None, view: View) -> U8:

@@ -51,8 +51,8 @@ def holds(facts: Facts, *, paused: bool, flat_asked: bool) -> dict[str, Any]:
 
 
 def shown(status: Status, *, light: Mapping[str, Any], page_ms: float | None) -> dict[str, Any]:
-    """Return what a page that displays the panels needs to know of the latest refresh, whose newest sample was
-    captured at `page_ms` on the page's clock.
+    """Return what a page that displays the panels needs to know of the latest refresh.
+    Its newest sample was captured at `page_ms` on the page's clock.
     """
     account, frame, solution = status.refresh.account, status.refresh.frame, status.refresh.solution
     return {
@@ -72,7 +72,7 @@ def shown(status: Status, *, light: Mapping[str, Any], page_ms: float | None) ->
 
 
 def snapshot(status: Status, run: Run) -> dict[str, Any]:
-    """Return the answer to a `status` request: a refresh's status and the figures that `run` has collected so far."""
+    """Return the answer to a `status` request, with the figures that `run` has collected so far."""
     account, facts, live = status.refresh.account, status.facts, status.live
     return {
         "state": status.name,

@@ -24,7 +24,7 @@ class Refresh:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Status:
-    """A run's status as of its latest refresh. The daemon's answers, pages and files are made from it alone."""
+    """Status of a run as of its latest refresh, from which answers, pages and files are made."""
 
     refresh: Refresh
     name: str  # of the state, such as `degraded: sensor`

@@ -42,7 +42,7 @@ class SolverState(Protocol):
     """One stack's panels on one device, kept between frames. A state may be used by only one thread."""
 
     def begin(self, job: Job, geometry: Geometry, *, resumed: bool = False) -> AbstractContextManager[OpenSolution]:
-        """Load a job's targets, and begin a solution. Until a panel is set, all pixels in its box have the rest value.
+        """Load a job's targets, and begin a solution. Until a panel is set, its box has the rest value.
         If `resumed`, the panels and the momentum of the previous solution are kept, which must have had the same
         geometry.
         """

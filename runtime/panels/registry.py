@@ -15,7 +15,9 @@ if TYPE_CHECKING:
 
 
 class OffscreenPanels(PanelSink):
-    """Output with no screen, which accepts frames but does not draw them. A web page, for example, draws them."""
+    """Output with no screen, which accepts frames but does not draw them.
+    A web page, for example, draws them.
+    """
 
     def __init__(self, clock: Clock, *, name: str = "offscreen") -> None:
         self._clock, self.name = clock, name

@@ -29,9 +29,9 @@ def may_focus(info: ContentInfo, focus: Focus) -> bool:
 
 
 def focused_job(content: ContentSource, job: Job, *, time_ns: int, focus: Focus) -> Job | None:
-    """Draw content for further points of the pupils, and return a job that includes them, or None if the content does
-    not qualify. `job` was the last to be drawn from the content, for pinhole eyes on the full raster at the same time.
-    Raises ContentFailure if the content cannot be drawn.
+    """Draw content for further points of the pupils, and return a job that includes them, or None if
+    the content does not qualify. `job` was the last to be drawn from the content, for pinhole eyes on the full
+    raster at the same time. Raises ContentFailure if the content cannot be drawn.
     """
     raster = _drawn_on(job)
     if not may_focus(content.info, focus) or len(job.eyes_m) != EYES_MOST or raster is None:

@@ -54,8 +54,8 @@ class Samples(ABC):
 
 
 def searched(frame: SensorFrame, finder: Finder | None, *, keep_images: bool = False) -> SensorFrame:
-    """Return a sample with the eyes found in its pictures, without the pictures themselves unless `keep_images`.
-    No finder leaves the sample's eyes unchanged.
+    """Return a sample with the eyes found in its pictures, without the pictures themselves unless
+    `keep_images`. No finder leaves the sample's eyes unchanged.
     """
     if finder is not None:
         first, *others = finder.find_all(frame) or (None,)

@@ -1,4 +1,6 @@
-"""Colours of pictures and films: those declared by code (ITU-T H.273), and transparent ones over a background."""
+"""Colours of pictures and films: those declared by code (ITU-T H.273), and transparent ones over
+a background.
+"""
 
 from __future__ import annotations
 

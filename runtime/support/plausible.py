@@ -14,7 +14,9 @@ PART_MAX_BYTES = 255  # maximum length of each part of a path
 
 
 def within(low: float, high: float, unit: str, *, zero: bool = False) -> AfterValidator:
-    """Return a validator for numbers in a range, with the messages of `refusal`. `zero` also accepts 0, "not set"."""
+    """Return a validator for numbers in a range, with the messages of `refusal`.
+    `zero` also accepts 0, "not set".
+    """
 
     def check(value: float) -> float:
         problem = "" if zero and value == 0 else refusal(value, low, high, unit)

@@ -50,7 +50,7 @@ def test_every_refresh_is_aligned_to_the_eyes_of_its_own_light(stage: Stage) -> 
     assert not np.array_equal(done.frame.solved_from_shown[0], np.eye(3))
 
 
-def test_a_late_panel_is_aligned_to_the_eyes_of_its_own_display_time() -> None:
+def test_a_late_panel_is_aligned_to_eyes_of_its_own_time() -> None:
     speed_m_s, delays_ms = 0.2, (0.0, 4.0, 12.0)
     stage = Stage(output={"panels": [{"delay_ms": delay_ms} for delay_ms in delays_ms]})
     stage.solver.hand_over(solved=solution(2))

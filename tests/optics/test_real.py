@@ -280,7 +280,7 @@ def test_a_late_panel_shows_the_previous_frame_for_its_delay() -> None:
 
 @pytest.mark.parametrize(("late_ms", "response_ms"), [(5.0, 0.0), (25.0, 0.0), (0.0, 4.0), (7.5, 4.0)])
 @pytest.mark.parametrize("allowed_ms", [0.0, 5.0])
-def test_a_panel_lags_by_its_delay_and_response_less_what_is_allowed_for(
+def test_a_panel_lags_by_delay_and_response_less_what_is_allowed(
     late_ms: float, response_ms: float, allowed_ms: float
 ) -> None:
     timing = Timing(late_ms=(0, 0, late_ms), response_ms=response_ms, allowed_ms=(0, 0, allowed_ms), rate_hz=100.0)

@@ -82,7 +82,7 @@ def test_a_remedy_gives_light_back(subject: Subject) -> None:
         assert bench.light(one.after, 1500)[0] > before + 1, name
 
 
-def test_what_a_late_panel_costs_comes_back_if_the_alignment_allows_for_it(subject: Subject) -> None:
+def test_a_late_panel_costs_little_if_the_alignment_allows_for_it(subject: Subject) -> None:
     bench = Bench([subject])
     before, after = (
         bench.light(partial(late_front, 1e3 / 60, allowed=allowed, head_m_s=0.3), 1500)[0] for allowed in (False, True)

@@ -49,7 +49,9 @@ class GlBackend:
 
 
 class GlState:
-    """`SolverState` for OpenGL: textures that are kept between solutions. For the OpenGL context's thread only."""
+    """`SolverState` for OpenGL: textures that are kept between solutions.
+    For the OpenGL context's thread only.
+    """
 
     def __init__(self, passes: Passes, stack: PanelStack) -> None:
         """Create the state, which may share `passes`. Raises InputError if a panel is too large for the driver."""
@@ -85,7 +87,7 @@ class GlState:
         return self.texture(name, size, components, dtype=dtype)
 
     def panel_texture(self, role: str, n: int, components: int) -> Any:
-        """Return the texture that has a role for a panel. It is as large as the panel, so that its box can move."""
+        """Return the texture with a role for a panel, as large as the panel, so that its box can move."""
         key = (self._names.get(f"{role} {n}", role), n)
         return self.texture(key, (self.stack.width_px, self.stack.height_px), components, dtype="nu2")
 

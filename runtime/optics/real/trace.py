@@ -260,8 +260,8 @@ class Lags:
         return self.timing.is_still
 
     def starts(self, row_share: F64) -> F64:
-        """Return when each panel updates rows (P,) at 0 (top) to 1, (N, P), relative to the middle row. The result is
-        (N, 1) if all rows are updated at once, and so are the other methods' results.
+        """Return when each panel updates rows (P,) at 0 (top) to 1, (N, P), relative to the middle row.
+        The result is (N, 1) if all rows are updated at once, and so are the other methods' results.
         """
         bottom_up = self.timing.bottom_up or (False,) * len(self.late)
         down = self.timing.scan * (row_share - 0.5) if self.timing.scan else np.zeros(1)
@@ -284,8 +284,9 @@ class Lags:
         return np.stack([*weights, fading * whole**older]), newest
 
     def behind(self, index: int, newest: F64) -> F64:
-        """Return how far the head is past the place that a panel's newest frames (P,) are aligned to, in refreshes. A
-        frame is aligned to the middle of the refresh that the first panel shows it, plus `allowed_ms`.
+        """Return how far the head is past the place that a panel's newest frames (P,) are aligned to, in
+        refreshes. A frame is aligned to the middle of the refresh that the first panel shows it, plus
+        `allowed_ms`.
         """
         allowed_ms = self.timing.allowed_ms[index] if self.timing.allowed_ms else 0.0
         return newest + self.moment - 0.5 - allowed_ms * self.timing.rate_hz / 1e3
