@@ -27,10 +27,7 @@ Made = tuple[str, str]  # value of `scene`, and further lines for the [content] 
 def ball_and_ground(width: int, height: int, eye_x: float = 0.0) -> tuple[Image.Image, Image.Image]:
     """Draw a ball and bars in front of a background, and a depth map where white is nearest.
 
-    Args:
-        width: Picture width.
-        height: Picture height.
-        eye_x: The ball's shift in pixels, used to draw another view; nearer parts of the scene shift more.
+    `eye_x` is the ball's shift in pixels, used to draw another view; nearer parts of the scene shift more.
     """
     colour, depth = Image.new("RGB", (width, height), (235, 225, 205)), Image.new("L", (width, height), 50)
     pen, deep = ImageDraw.Draw(colour), ImageDraw.Draw(depth)

@@ -83,16 +83,10 @@ class Views:
         fov_deg: float | None,
         places_m: ArrayLike = ((0.0, 0.0, 0.0),),
     ) -> Views:
-        """Create the rays through the pixels of either the eyes' pictures or the middle panel.
+        """Create the rays of two eyes (2, 3) in the `stack` frame through the pixels of their pictures.
 
-        Args:
-            eyes_m: Left and right eye positions (2, 3) in the `stack` frame.
-            fov_deg: The pictures' horizontal field of view, or None for the middle panel's raster.
-            places_m: Displacements (P, 3) of both eyes. Each displacement adds two sets of rays, which pass through the
-                same points on the middle panel.
-
-        Raises:
-            ValueError: An eye is in the middle panel's plane.
+        Without a horizontal field of view, the raster is the middle panel's. Each displacement (P, 3) of both eyes adds
+        two sets of rays, through the same points on the middle panel. Raises ValueError if an eye is in its plane.
         """
         sets = []
         for place in np.asarray(places_m, np.float64):
@@ -106,15 +100,10 @@ class Views:
 
 
 def light(panels: Tensor, views: Views) -> tuple[Tensor, Tensor]:
-    """Compute the intensities at the eyes from (L1) and (L2).
+    """Compute the intensities (E, C, h, w) at the eyes from (L1) and (L2), with a mask of rays.
 
-    Args:
-        panels: Panel values (N, C, H, W) in [0, 1].
-        views: The eyes' rays.
-
-    Returns:
-        The intensities (E, C, h, w), differentiable with respect to the panels, and a mask (E, 1, h, w) of the rays
-        that cross all panels.
+    The panel values (N, C, H, W) are in [0, 1]; the intensities are differentiable with respect to them. The mask
+    (E, 1, h, w) is of the rays that cross all panels.
     """
     bundles, counts = _bundles(panels, views)
     return torch.stack([(1 - reduce(torch.mul, z).real) / 2 for z in bundles]), counts
@@ -123,16 +112,10 @@ def light(panels: Tensor, views: Views) -> tuple[Tensor, Tensor]:
 def traced(
     panels: Tensor, views: Views, *, rays: int = 2, random: torch.Generator | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Estimate the intensities at the eyes without bias by tracing random rays.
+    """Estimate the intensities of `light` without bias by tracing random rays.
 
-    Args:
-        panels: Panel values (N, C, H, W) in [0, 1].
-        views: The eyes' rays.
-        rays: Number of rays across and down a pixel. The pixel is divided into rays² equal parts, and each ray is at a
-            random position in one part.
-
-    Returns:
-        The intensities (E, C, h, w), and a mask (E, 1, h, w) of the pixels whose rays all cross all panels.
+    A pixel is divided into rays² equal parts, and each ray is at a random position in one part. The mask is of the
+    pixels whose rays all cross all panels.
     """
     size, angle = (views.height_px, views.width_px), torch.pi * panels
     total, counts = torch.zeros((), dtype=panels.dtype, device=panels.device), torch.tensor(True, device=panels.device)
@@ -149,16 +132,10 @@ def traced(
 def light_db(
     panels: Tensor, targets: Tensor, views: Views, *, rays: int = 3, random: torch.Generator | None = None
 ) -> float:
-    """Return the PSNR, in dB, of the light at pinhole eyes.
+    """Return the PSNR, in dB, of the light at pinhole eyes for target intensities (E, C, h, w).
 
-    The error is estimated twice, with independent rays. The mean product of the two estimates is an unbiased estimate
-    of the squared error.
-
-    Args:
-        panels: Panel values (N, C, H, W) in [0, 1].
-        targets: Target intensities (E, C, h, w).
-        views: The eyes' rays.
-        rays: Number of rays across and down a pixel in each of the two estimates.
+    The error is estimated twice, with independent rays, `rays` across and down a pixel each time. The mean product of
+    the two estimates is an unbiased estimate of the squared error.
     """
     (a, in_a), (b, in_b) = (traced(panels, views, rays=rays, random=random) for _ in range(2))
     counts = in_a & in_b
@@ -177,21 +154,12 @@ def step(
     floor: float = FLOOR,
     grey: Sequence[int] = (),
 ) -> tuple[Tensor, Tensor]:
-    """Compute one solver step from (L5).
+    """Compute one solver step from (L5): the new panel values x' (N, C, H, W) and their extrapolation y'.
 
-    Args:
-        x: Panel values (N, C, H, W).
-        y: Values (N, C, H, W) extrapolated from x by the previous step's momentum. Initially they equal x.
-        targets: Target intensities (V, C, h, w) for each view. If they have k times as many rows as the rays, the sets
-            take k turns, and each uses every k-th row.
-        views: The eyes' rays.
-        size: Step size.
-        momentum: Momentum used to extrapolate.
-        floor: Lower limit for the curvature per set of rays.
-        grey: Panels that have one value for all channels. Their gradient and curvature are means over the channels.
-
-    Returns:
-        The new panel values x' and their extrapolation y'.
+    `y` is extrapolated from x by the previous step's momentum; initially it equals x. If the targets (V, C, h, w) of
+    the views have k times as many rows as the rays, the sets take k turns, and each uses every k-th row. `floor` limits
+    the curvature per set of rays. Panels in `grey` have one value for all channels: their gradient and curvature are
+    means over the channels.
     """
     sets, turns = len(views.panels_from_rays), targets.shape[-2] // views.height_px
     back, size_px = torch.linalg.inv(views.panels_from_rays), y.shape[-2:]
@@ -212,15 +180,7 @@ def step(
 
 
 def improved(panels: Tensor, targets: Tensor, views: Views, sizes: Sequence[Any], momenta: Sequence[Any]) -> Tensor:
-    """Apply several solver steps to the panels.
-
-    Args:
-        panels: Initial panel values (N, C, H, W).
-        targets: Target intensities (V, C, h, w) for each view.
-        views: The eyes' rays.
-        sizes: Each step's size.
-        momenta: Each step's momentum.
-    """
+    """Apply a solver step of each size and momentum to the initial panels."""
     x = y = panels
     for size, momentum in zip(sizes, momenta, strict=True):
         x, y = step(x, y, targets, views, size=size, momentum=momentum)
@@ -228,11 +188,7 @@ def improved(panels: Tensor, targets: Tensor, views: Views, sizes: Sequence[Any]
 
 
 def _bundles(panels: Tensor, views: Views) -> tuple[list[Tensor], Tensor]:
-    """Return the complex values z_n of (L1) and a mask of valid rays.
-
-    Returns:
-        A tensor (N, C, h, w) for each set of rays, and a mask (E, 1, h, w) of rays that cross all panels.
-    """
+    """Return the complex values z_n (N, C, h, w) of (L1) for each set of rays, and the mask of `light`."""
     angle = torch.pi * panels
     parts = torch.cat([torch.cos(angle), torch.sin(angle)], dim=1)  # (N, 2C, H, W)
     bundles, counts = [], []
@@ -246,18 +202,11 @@ def _bundles(panels: Tensor, views: Views) -> tuple[list[Tensor], Tensor]:
 def _sample(
     images: Tensor, matrices: Tensor, size: Sequence[int], *, near_px: float, within: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Resample images through homographies.
+    """Resample images (N, K, H, W) through homographies (N, 3, 3) from the result's pixels (h, w) to theirs.
 
-    Args:
-        images: Images (N, K, H, W).
-        matrices: Homographies (N, 3, 3) from the result's pixels to the images' pixels.
-        size: The result's height and width (h, w).
-        near_px: Minimum distance of valid samples from an image's edges. It may be negative.
-        within: Column and row positions (2, h, w) in [0, 1] inside the result's pixels, to sample the nearest pixels.
-            By default, samples are taken bilinearly at pixel centres.
-
-    Returns:
-        The samples (N, K, h, w), which are zero where they are not valid, and a mask (N, 1, h, w) of valid samples.
+    Samples nearer than `near_px` (which may be negative) to an image's edges are zero and not valid; the mask
+    (N, 1, h, w) is of the valid ones. They are bilinear at pixel centres, or the nearest pixels at column and row
+    positions `within` (2, h, w) the result's pixels, in [0, 1].
     """
     height, width = images.shape[-2:]
     to: dict[str, Any] = {"dtype": torch.float64, "device": images.device}

@@ -96,11 +96,8 @@ def focal_stack(
 ) -> FocalStack:
     """Solve for two eyes, then focus the right eye at every plane of PLANES_M.
 
-    Args:
-        painter: Painter that draws the cards (`cards_painter`).
-        model: Model name, or path of an ONNX file.
-        focus: Solve with separate pictures for points of the pupils, rather than for pinhole eyes.
-        progress: Function called after each plane with the number of planes finished and the total number.
+    `painter` draws the cards (`cards_painter`). `focus` solves with separate pictures for points of the pupils, rather
+    than for pinhole eyes. `progress` is told the number of planes finished and of all planes.
     """
     eyes = eyes_at(distance_m=DISTANCE_M)
     layers = cards_layers(painter, stack, eyes, model=model, focus=focus)
