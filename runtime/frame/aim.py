@@ -13,6 +13,7 @@ from runtime.frame.effort import HORIZON_S, Costs, EffortChooser, Outlook, candi
 from runtime.frame.served import matched, moved_m2, sigma_factor
 from runtime.frame.solver_host import SolverHost
 from runtime.frame.viewer import Viewer
+from runtime.model.solver import FOCUS_STEPS
 from runtime.optics.alignment import midpoints
 from runtime.plan.focusing import may_focus
 from runtime.records import F64, Effort, EyesEstimate, EyesLabel, FrameTiming, Solution, SolveRequest
@@ -212,10 +213,10 @@ class Aim:
 
 
 def focused(shown: Solution, most: int, costs: Costs, *, horizon_s: float) -> Effort | None:
-    """Return the effort of at most `most` steps that gives a resting head's solution, otherwise final,
-    focus, or None.
+    """Return the effort that gives a resting head's solution, otherwise final, focus, or None. A model
+    that runs `most` steps, if any, can do so.
     """
     if shown.effort is None or shown.effort.reduction > 1 or shown.effort.focus or most < 1:
         return None
-    effort = Effort(1, most, focus=True)
+    effort = Effort(1, FOCUS_STEPS, focus=True)
     return effort if costs.ms(effort) < FOCUS_SHARE * 1e3 * horizon_s else None

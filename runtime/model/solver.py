@@ -31,6 +31,7 @@ COARSE = ((8, 16), (4, 16), (2, 12))  # without a network: divisors of the first
 COARSE_SIZE = 1.3  # size of these steps
 COARSE_LEAST_PX = 32  # minimum rows and columns of a raster
 REDUCTIONS = (1, 2, 3, 4)  # supported rasters, given as divisors of the display's rows and columns
+FOCUS_STEPS = 16  # steps of a solution with focus; fewer gain half as much on the retina, and more no more
 REFINED_STEPS = 8  # a solution is continued for up to this many steps in total, as many as `best` has
 IN_TURN: tuple[Places, ...] = ("rising", "middle", "falling", "middle")
 REFINING = (Step(size=0.8, places="falling"), Step(size=0.8, places="rising"))  # alternate after the model's steps
@@ -40,6 +41,12 @@ def steps_from_even(steps: int) -> tuple[Step, ...]:
     """Return the steps to run without a network, instead of `steps`, from coarser rasters."""
     sizes = (1.2,) * (2 * steps) + (0.8,) * steps
     return tuple(Step(size=size, places=IN_TURN[n % 4]) for n, size in enumerate(sizes))
+
+
+def steps_for_focus() -> tuple[Step, ...]:
+    """Return the steps for points of the pupils, whose two halves take turns."""
+    last = FOCUS_STEPS - 1
+    return tuple(Step(size=1.3 - 0.5 * n / last, places=("rising", "falling")[n % 2]) for n in range(FOCUS_STEPS))
 
 
 def enlarged(codes: I16, n: int, coarse: Geometry, geometry: Geometry) -> I16:
@@ -179,6 +186,8 @@ class StepPredictor(Predictor):
                 self._begin(proposed, geometry, solving)
             watch.lap("finish")
             steps = self._steps if self._is_proposed(job) else self._steps_from_even
+            if job.targets.points > 1:
+                steps = steps_for_focus()
             while done < (len(steps) if job.steps is None else job.steps):
                 if job.deadline_ns is not None and perf_counter_ns() >= job.deadline_ns:
                     break

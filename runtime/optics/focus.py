@@ -1,23 +1,22 @@
 """Retina pictures of an eye that focuses at a distance, and their error (docs/contracts.md).
 
-The eye sees the mean of the pinhole pictures through all points of its pupil. To focus at a distance f along the gaze,
-these pictures are shifted until they coincide for points at that distance: the picture through the point (right, up) of
-the pupil is shifted by focal_px·right/f to the right and by focal_px·up/f upwards.
+The eye sees the mean of the pinhole pictures through all points of its pupil. To focus on a plane x = plane_m, these
+pictures are drawn on the same pixels of that plane, so that they coincide for points on it.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from runtime.optics.pupil import PUPIL_MM
 from runtime.optics.quality import psnr_db
-from runtime.optics.retina import Rays, average, pupil_points, through_layers
-from runtime.optics.stack import PanelStack
-from runtime.optics.views import image_from_stack, stack_from_eye
+from runtime.optics.retina import Rays, Retina, average, pupil_points, through_layers
+from runtime.optics.stack import PanelStack, Plane, PlaneRaster
+from runtime.optics.views import raster_from_stack, stack_from_eye
 from runtime.records import F32, F64, U8, Eyes
 
 # Points of each pupil that get separate pictures when content is solved for focus, as (right, up) in metres. The centre
@@ -27,56 +26,65 @@ SOLVED_POINTS_M = ((0.0, 0.0), (0.0012, 0.0), (-0.0012, 0.0), (0.0, 0.0012), (0.
 
 
 @dataclass(frozen=True, slots=True)
-class FocusCamera:
-    """Size and horizontal field of view of a retina picture."""
+class RetinaPixels:
+    """Pixels of a retina picture: the middle panel's, or a part of them, as the eye sees them. Smaller ones would show
+    the panels' own pixels in every picture, whether the eye can focus or not.
+    """
 
-    width_px: int
-    height_px: int
-    fov_deg: float
+    raster: PlaneRaster  # in the plane of the middle panel
 
-    def projection(self, eye_m: F64, point_m: F64, *, focus_m: float) -> F64:
-        """Return the 3x4 projection through a point (right, up) of the pupil, refocused to `focus_m` along
-        the gaze. The third homogeneous coordinate of a projected point is its distance from the eye along the gaze, in
-        metres.
-        """
-        centre = image_from_stack(eye_m, width_px=self.width_px, height_px=self.height_px, fov_deg=self.fov_deg)
-        # As the pupil's point moves, points in front of the plane in focus move the opposite way, and points behind it
-        # the same way.
-        focal_px = self.width_px / 2 / math.tan(math.radians(self.fov_deg / 2))
-        out_of_focus = centre[2] / focus_m - [0.0, 0.0, 0.0, 1.0]
-        return centre + np.outer([focal_px * point_m[0], -focal_px * point_m[1], 0.0], out_of_focus)
-
-    def through(self, matrix: F64, layers: U8, stack: PanelStack) -> F32:
-        """Return the (h, w, 3) picture of the layers as seen through a projection."""
-        u, v = (np.arange(count, dtype=np.float64) + 0.5 for count in (self.width_px, self.height_px))
-        rays = Rays(matrix, u, v[:, None])
-        panels = [stack.panel(index) for index in range(stack.count)]
-        seen = through_layers(
-            layers, lambda rows: (rays.on(panel, rows) for panel in panels), rays.toward_panels(), stack
+    def on_plane(self, eye_m: F64, plane_m: float) -> PlaneRaster:
+        """Return the pixels projected from an eye at (3,) in `stack` onto the plane x = `plane_m`."""
+        raster = self.raster
+        scale, shift_m = raster.plane.scale_shift_to(Plane(plane_m), eye_m)
+        return replace(
+            raster,
+            x_m=plane_m,
+            left_m=float(raster.left_m * scale + shift_m[0]),
+            top_m=float(raster.top_m * scale + shift_m[1]),
+            pitch_u_m=float(raster.pitch_u_m * scale),
+            pitch_v_m=float(raster.pitch_v_m * scale),
         )
-        return seen.image
 
-    def focused(self, eye_m: F64, picture_of: Callable[[F64], F32], *, plane_m: float) -> F32:
-        """Return the (h, w, 3) retina picture of an eye that focuses on the point (`plane_m`, 0, 0) in
-        `stack`. `picture_of` returns the picture through a projection.
+    def projections(self, eye_m: F64, *, plane_m: float) -> list[tuple[F64, F64]]:
+        """Return points (3,) of an eye's pupil, the centre first, with the 3x4 projection of `stack` through
+        each to the pixels, for an eye that focuses on the plane x = `plane_m`.
         """
-        gaze = -stack_from_eye(eye_m)[:3, 2]
-        focus_m = float((np.array([plane_m, 0.0, 0.0]) - eye_m) @ gaze)
-        points = pupil_points(PUPIL_MM / 1e3)
-        return average(picture_of(self.projection(eye_m, point, focus_m=focus_m)) for point in points)
+        raster, pose = self.on_plane(eye_m, plane_m), stack_from_eye(eye_m)
+        points = eye_m + pupil_points(PUPIL_MM / 1e3) @ pose[:3, :2].T
+        return [(point, raster_from_stack(point, raster)) for point in points]
+
+    def seen(self, layers: U8, stack: PanelStack, eye_m: F64, *, plane_m: float) -> Retina:
+        """Compute the retina picture of an eye that looks through layers and focuses on x = `plane_m`."""
+        u, v = (np.arange(count, dtype=np.float64) + 0.5 for count in (self.raster.width_px, self.raster.height_px))
+        panels = [stack.panel(index) for index in range(stack.count)]
+        mask = np.ones((len(v), len(u)), bool)
+
+        def through(matrix: F64) -> F32:
+            rays = Rays(matrix, u, v[:, None])
+            retina = through_layers(layers, lambda rows: (rays.on(panel, rows) for panel in panels), mask, stack)
+            mask[:] = retina.mask
+            return retina.image
+
+        image = average(through(matrix) for _, matrix in self.projections(eye_m, plane_m=plane_m))
+        return Retina(image, mask)
+
+    def true(self, picture_of: Callable[[F64, F64], F32], eye_m: F64, *, plane_m: float) -> F32:
+        """Return the (h, w, 3) retina picture of an eye that looks at a scene and focuses on x = `plane_m`.
+        `picture_of` draws the picture from a point (3,) of the pupil through a projection.
+        """
+        return average(picture_of(point, matrix) for point, matrix in self.projections(eye_m, plane_m=plane_m))
 
 
-def retina_db(pictures: Iterable[tuple[F32, F32]]) -> float:
-    """Return the PSNR, of one mean squared error, of (h, w, 3) retina pictures against the scene's own.
-    There is a pair of pictures for each eye and each of three distances.
+def retina_db(pictures: Iterable[tuple[Retina, F32]]) -> float:
+    """Return the PSNR, of one mean squared error, of retina pictures against the scene's own, (h, w, 3).
+    There is a pair of pictures for each eye and each of three distances. NaN if no ray crosses all panels.
     """
     total, counted = 0.0, 0
     for seen, true in pictures:
-        error = np.asarray(seen, np.float64) - true
+        error = (seen.image - true)[seen.mask].astype(np.float64)
         total, counted = total + float((error * error).sum()), counted + error.size
-    if not counted:
-        raise ValueError("there must be at least one retina picture")
-    return psnr_db(total / counted)
+    return psnr_db(total / counted) if counted else math.nan
 
 
 def points_of_pupils(eyes_m: Eyes) -> F64:

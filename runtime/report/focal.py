@@ -14,14 +14,16 @@ from runtime.content.scenes import Scene, Thing
 from runtime.model.job import Job, Targets, drawn_views
 from runtime.model.predictor import load_predictor
 from runtime.optics.carried import intensities
-from runtime.optics.focus import FocusCamera, points_of_pupils, retina_db
+from runtime.optics.focus import RetinaPixels, points_of_pupils, retina_db
 from runtime.optics.pupil import PUPIL_MM
+from runtime.optics.rect import PixelRect
+from runtime.optics.retina import Retina
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import raster_from_stack
 from runtime.records import F32, F64, U8, Eyes
 from runtime.report.pairs import PairPainter, eyes_at
 
-CAMERA = FocusCamera(720, 300, 18.0)
+SEEN_M = 0.126, 0.052  # width and height, in the middle panel, of the part that the pictures show
 PUPIL_M = PUPIL_MM / 1e3
 DISTANCE_M = 0.4
 CARDS_M = (-0.05, 0.0, 0.045)  # x of the three cards, frame `stack`
@@ -59,14 +61,22 @@ class FocalStack:
     focus: bool  # True if the points of the pupils had separate pictures
 
 
-def card_windows(eye_m: F64) -> list[tuple[slice, slice]]:
+def seen_pixels(stack: PanelStack) -> RetinaPixels:
+    """Return the middle panel's pixels that the pictures show."""
+    raster = stack.panel(stack.count // 2)
+    width_px, height_px = round(SEEN_M[0] / raster.pitch_u_m), round(SEEN_M[1] / raster.pitch_v_m)
+    u0, v0 = (raster.width_px - width_px) // 2, (raster.height_px - height_px) // 2
+    return RetinaPixels(PixelRect(u0, v0, u0 + width_px, v0 + height_px).cut(raster))
+
+
+def card_windows(pixels: RetinaPixels, eye_m: F64) -> list[tuple[slice, slice]]:
     """Return the rows and columns of each card in the eye's picture, slightly inside the card's edges."""
     windows = []
-    matrix = CAMERA.projection(eye_m, np.zeros(2), focus_m=DISTANCE_M)
+    matrix = raster_from_stack(eye_m, pixels.raster)
     for x, y in zip(CARDS_M, OFFSETS_M, strict=True):
         corners = [matrix @ [x, y + dy, dz, 1.0] for dy in (-0.012, 0.012) for dz in (-0.014, 0.014)]
-        pixels = np.array([c[:2] / c[2] for c in corners])
-        (left, top), (right, bottom) = pixels.min(0).astype(int), np.ceil(pixels.max(0)).astype(int)
+        places = np.array([c[:2] / c[2] for c in corners])
+        (left, top), (right, bottom) = places.min(0).astype(int), np.ceil(places.max(0)).astype(int)
         windows.append((slice(max(top, 0), bottom), slice(max(left, 0), right)))
     return windows
 
@@ -102,23 +112,19 @@ def focal_stack(
     eyes = eyes_at(distance_m=DISTANCE_M)
     layers = cards_layers(painter, stack, eyes, model=model, focus=focus)
 
-    def shown(matrix: F64) -> F32:
-        return CAMERA.through(matrix, layers, stack)
+    pixels = seen_pixels(stack)
+    size = {"width_px": pixels.raster.width_px, "height_px": pixels.raster.height_px}
 
-    def drawn(eye: F64) -> Callable[[F64], F32]:
-        size = {"width_px": CAMERA.width_px, "height_px": CAMERA.height_px}
-        return lambda matrix: intensities(painter.draw(eye, matrix, **size))
+    def pictures(eye: F64, plane_m: float) -> tuple[Retina, F32]:
+        true = pixels.true(lambda at, matrix: intensities(painter.draw(at, matrix, **size)), eye, plane_m=plane_m)
+        return pixels.seen(layers, stack, eye, plane_m=plane_m), true
 
     slices: list[Slice] = []
     for index, plane_m in enumerate(PLANES_M):
-        seen, true = (CAMERA.focused(eyes[1], picture, plane_m=plane_m) for picture in (shown, drawn(eyes[1])))
-        slices.append(Slice(plane_m, seen, true))
+        seen, true = pictures(eyes[1], plane_m)
+        slices.append(Slice(plane_m, seen.image, true))
         progress(index + 1, len(PLANES_M))
-    retina = retina_db(
-        (CAMERA.focused(eye, shown, plane_m=plane_m), CAMERA.focused(eye, drawn(eye), plane_m=plane_m))
-        for eye in eyes
-        for plane_m in FOCUSED_M
-    )
+    retina = retina_db(pictures(eye, plane_m) for eye in eyes for plane_m in FOCUSED_M)
     away = [math.dist((x, 0.0, 0.0), eyes[1]) for x in PLANES_M]
     cards = tuple(
         Accommodation(
@@ -126,7 +132,7 @@ def focal_stack(
             sharpest(away, [contrast(s.shown, window) for s in slices]),
             sharpest(away, [contrast(s.true, window) for s in slices]),
         )
-        for x, y, window in zip(CARDS_M, OFFSETS_M, card_windows(eyes[1]), strict=True)
+        for x, y, window in zip(CARDS_M, OFFSETS_M, card_windows(pixels, eyes[1]), strict=True)
     )
     return FocalStack(model, tuple(slices), cards, retina, focus)
 
@@ -145,10 +151,12 @@ def cards_layers(painter: PairPainter, stack: PanelStack, eyes_m: Eyes, *, model
 
 
 def cards_painter(stack: PanelStack) -> PairPainter:
-    """Return a painter for three finely textured cards: behind, in and in front of the middle panel."""
-    card = shapes.card(0.034, 0.036, repeat=(3.4, 3.6))
+    """Return a painter for three textured cards: behind, in and in front of the middle panel. Their
+    details are wider than a panel's pixel, because narrower ones are lost whether the eye can focus or not.
+    """
+    card = shapes.card(0.034, 0.036)
     things = tuple(
-        Thing(card, "checker", (x, y, 0.0), colour, lit=False)
+        Thing(card, "crate", (x, y, 0.0), colour, lit=False)
         for x, y, colour in zip(CARDS_M, OFFSETS_M, ((1.0, 0.75, 0.7), (0.75, 1.0, 0.75), (0.7, 0.8, 1.0)), strict=True)
     )
     return PairPainter(Scene("cards", things), stack)

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from runtime.frame.aim import Slots, focused
 from runtime.frame.effort import Costs
+from runtime.model.solver import FOCUS_STEPS
 from runtime.records import Effort, Solution
 from tests.frame.fakes import EYES
 
@@ -35,7 +36,7 @@ def test_the_middle_is_that_of_the_refreshes_between_two_solutions(cost_ns: int,
         (Effort(1, 6), 2.0, 8, True),
         (Effort(2, 6), 2.0, 8, False),  # a finer raster comes first
         (Effort(1, 8, focus=True), 2.0, 8, False),
-        (Effort(1, 6), 25.0, 8, False),  # 8 steps of 75 ms are more than a quarter of two seconds
+        (Effort(1, 6), 15.0, 8, False),  # 16 steps of 45 ms are more than a quarter of two seconds
         (Effort(1, 6), 2.0, 0, False),  # a model without steps
     ],
 )
@@ -45,7 +46,7 @@ def test_a_resting_head_s_finished_solution_gets_focus_if_time_allows(
     shown = Solution(1, np.zeros((3, 2, 2, 4), np.uint8), EYES, 0, effort=done)
     costs = Costs({1: {"render": 1.0, "step": step_ms}, 2: {"render": 0.3, "step": 0.5}})
     effort = focused(shown, most, costs, horizon_s=2.0)
-    assert effort == (Effort(1, most, focus=True) if gets else None)
+    assert effort == (Effort(1, FOCUS_STEPS, focus=True) if gets else None)
 
 
 def test_focus_costs_the_drawing_of_ten_pictures_and_three_steps_for_one() -> None:
