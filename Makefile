@@ -139,7 +139,7 @@ $(VENV)/.created:
 $(VENV)/.runtime: $(VENV)/.created requirements/runtime.lock pyproject.toml $(wildcard runtime/kernels/*.?pp) | system
 	@echo "1 of 2: downloading and installing $$(grep -c == requirements/runtime.lock) packages in $(VENV) (minutes on a slow line)"
 	$(BIN)/python -m pip install $(PROGRESS) -r requirements/runtime.lock
-	@echo "2 of 2: compiling the kernels (a minute on a slow machine)"
+	@echo "2 of 2: compiling the kernels (two minutes on a slow machine)"
 	$(BIN)/python -m pip install --quiet --no-deps --editable .
 	@touch $@
 
