@@ -7,7 +7,6 @@ program that reads slowly loses only its own messages. docs/programs.md describe
 from __future__ import annotations
 
 import asyncio
-import fcntl
 import hmac
 import io
 import json
@@ -37,6 +36,7 @@ from runtime.clock import NS_PER_S
 from runtime.errors import ContentFailure, InputError, one_line
 from runtime.records import F32, U8, U16
 from runtime.support.background import begin
+from runtime.support.channel import shared_memory
 from runtime.support.untrusted_input import parsed_json
 
 log = logging.getLogger("phasestack.content")
@@ -164,14 +164,12 @@ def decoded_jpeg(data: bytes, width_px: int, height_px: int) -> U8:
 class _Memory:
     """Memory that a program on the same machine can write its pictures to. A file in memory has no name, so it ends
     with the last process that uses it. The program opens it through this process's entry in /proc, which only the same
-    user can do. It cannot shrink, because reading beyond its end would end the process.
+    user can do.
     """
 
     def __init__(self, size_bytes: int) -> None:
         """Allocate the memory. Raises OSError if that is not possible."""
-        self._file = os.memfd_create("phasestack-program", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
-        os.ftruncate(self._file, size_bytes)
-        fcntl.fcntl(self._file, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL)
+        self._file = shared_memory("phasestack-program", size_bytes)
         self.path = f"/proc/{os.getpid()}/fd/{self._file}"
         self.bytes = size_bytes
         self.data = memoryview(mmap.mmap(self._file, size_bytes))  # unmapped once no picture refers to it

@@ -111,10 +111,13 @@ class Channel:
 
 
 def shared_memory(name: str, size: int) -> int:
-    """Return the descriptor of new shared memory, zeros, used as it is written. Raises OSError."""
+    """Return the descriptor of new shared memory, zeros, used as it is written. Raises OSError.
+
+    Its size is sealed: a process that reads beyond the end of a mapping that shrank would be ended.
+    """
     memory = os.memfd_create(name, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
     os.ftruncate(memory, size)
-    fcntl.fcntl(memory, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK)  # a process would be ended if its mapping shrank
+    fcntl.fcntl(memory, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL)
     return memory
 
 
