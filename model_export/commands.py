@@ -43,8 +43,7 @@ def train(
     scene: Annotated[str, typer.Option(help="scene or file to draw at random rotations and eye positions")] = "",
     pairs: Annotated[int, typer.Option(min=0, help="number of different pairs (0 for unlimited)")] = 0,
     panels: Annotated[
-        Path | None,
-        typer.Option(help="file with the geometry of the panels (default: random stacks of three panels)"),
+        Path | None, typer.Option(help="file with the geometry of the panels (default: random stacks of three panels)")
     ] = None,
     iterations: Annotated[int, typer.Option(min=1, help="total number of gradient steps")] = 2000,
     batch: Annotated[int, typer.Option(min=1, help="pairs per iteration")] = 1,
@@ -115,8 +114,7 @@ def export(
     arch: Annotated[str, typer.Option(help="fast, balanced, best, eyereal, unrolled, or module:Class")],
     out: Annotated[Path, typer.Option(help="ONNX file to write")],
     checkpoint: Annotated[
-        Path | None,
-        typer.Option(help="weights from `phasestack train`, or the published weights for eyereal"),
+        Path | None, typer.Option(help="weights from `phasestack train`, or the published weights for eyereal")
     ] = None,
     random_init: Annotated[
         int | None, typer.Option(min=0, help="use untrained weights generated from this seed")
@@ -155,10 +153,7 @@ def export(
         raise typer.Exit(1)
 
 
-def validate(
-    file: Annotated[Path, typer.Argument(help="ONNX file to check")],
-    as_json: JsonOption = False,
-) -> None:
+def validate(file: Annotated[Path, typer.Argument(help="ONNX file to check")], as_json: JsonOption = False) -> None:
     """Check that a model file meets its contract and gives valid results for extreme inputs.
 
     Exits with 1 if a check fails.

@@ -454,13 +454,7 @@ def _named(left: Any, right: Any) -> dict[str, Any]:
 
 
 def _checked(
-    left: Any,
-    right: Any,
-    *,
-    stack: PanelStack,
-    eyes_m: Eyes | None,
-    fov_deg: float,
-    cameras: Cameras | None,
+    left: Any, right: Any, *, stack: PanelStack, eyes_m: Eyes | None, fov_deg: float, cameras: Cameras | None
 ) -> _Pair:
     """Validate the arguments of `solve`, and resample pictures taken by other cameras. Raises ValueError."""
     given = _named(left, right)

@@ -14,8 +14,7 @@ from runtime.support.ranges import FOV_RANGE_DEG
 def solve(
     out: Annotated[Path, typer.Option(help="folder to write the layers to")],
     left: Annotated[
-        Path | None,
-        typer.Option(help="picture taken by a pinhole camera at the left eye, aimed at the stack's origin"),
+        Path | None, typer.Option(help="picture taken by a pinhole camera at the left eye, aimed at the stack's origin")
     ] = None,
     panels: Annotated[
         Path | None, typer.Option(help="TOML or JSON file with the stack geometry (width_m, height_m and x_m)")

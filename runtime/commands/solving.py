@@ -231,9 +231,7 @@ def checked_eyes(left_eye: tuple[float, ...], right_eye: tuple[float, ...], stac
     for option, eye in (("--left-eye", left_eye), ("--right-eye", right_eye)):
         if eye[0] <= max(stack.x_m):
             raise InputError(
-                "solve",
-                option,
-                f"x = {eye[0]:g} m is not in front of the panels; x must exceed {max(stack.x_m):g} m",
+                "solve", option, f"x = {eye[0]:g} m is not in front of the panels; x must exceed {max(stack.x_m):g} m"
             )
     separation_m = math.dist(left_eye, right_eye)
     if separation_m < SEPARATION_MIN_M:

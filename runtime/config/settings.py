@@ -62,8 +62,7 @@ class StackGeometry(Section):
         "times as bright, and shows one value for all three colours (leave empty if all panels have filters)",
     )
     registered_from_m: Point = Field(
-        (0.5, 0.0, 0.0),
-        description="eye position (in the stack frame) from which the registered panels look parallel",
+        (0.5, 0.0, 0.0), description="eye position (in the stack frame) from which the registered panels look parallel"
     )
 
     @model_validator(mode="after")
@@ -421,10 +420,7 @@ class LoopSettings(Section):
 class PlanSettings(Section):
     """Ways for the solver and the display loop to save work."""
 
-    enabled: bool = Field(
-        True,
-        description="skip work that is unnecessary for the scene or while the head is at rest",
-    )
+    enabled: bool = Field(True, description="skip work that is unnecessary for the scene or while the head is at rest")
     align: bool = Field(True, description="shift and scale the panels' pictures at every refresh to follow the eyes")
 
 

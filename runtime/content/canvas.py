@@ -68,14 +68,7 @@ class _Reducer:
         self._targets: dict[tuple[int, int], Any] = {}
 
     def reduced(
-        self,
-        depth: Any,
-        size: tuple[int, int],
-        *,
-        every: int,
-        first: tuple[int, int],
-        at_near: float,
-        at_far: float,
+        self, depth: Any, size: tuple[int, int], *, every: int, first: tuple[int, int], at_near: float, at_far: float
     ) -> F32:
         """Return values (rows, columns) linear in the smallest depth of each block, from `at_near` to
         `at_far`, 0 if empty. `size` is in blocks; `every` and `first` are those of `ContentSource.nearness`.

@@ -6,14 +6,7 @@ import numpy as np
 from scipy.special import logit
 
 from runtime.content.compressed_splats import spz_splats
-from runtime.content.gaussians import (
-    FLAT_HARMONIC,
-    Gaussians,
-    drawable,
-    flat_harmonics,
-    harmonic_basis,
-    moved,
-)
+from runtime.content.gaussians import FLAT_HARMONIC, Gaussians, drawable, flat_harmonics, harmonic_basis, moved
 from runtime.content.gltf_file import GltfFile, Table
 from runtime.content.parts import coded
 from runtime.content.shapes import Origin, placed

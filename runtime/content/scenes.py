@@ -103,12 +103,7 @@ def _room() -> tuple[Thing, ...]:
         Thing(shapes.fence(0.16, 0.10, bars=13, bar_m=0.002), "plain", (-0.075, 0.10, -0.058), (0.50, 0.62, 0.78)),
         Thing(shapes.box((0.07,) * 3), "crate", (-0.04, -0.05, -0.075), rotation=_turned(28)),
         Thing(shapes.torus(0.036, 0.012), "stripes", (0.02, 0.075, -0.045), rotation=_turned(-24, -12)),
-        Thing(
-            shapes.lettering("PHASE", cell_m=0.0042, depth_m=0.006),
-            "plain",
-            (0.0, 0.09, 0.07),
-            (0.95, 0.55, 0.16),
-        ),
+        Thing(shapes.lettering("PHASE", cell_m=0.0042, depth_m=0.006), "plain", (0.0, 0.09, 0.07), (0.95, 0.55, 0.16)),
         Thing(shapes.sphere(0.030), "globe", (0.085, -0.035, 0.028)),
         Thing(
             shapes.lettering("3D", cell_m=0.0050, depth_m=0.009),

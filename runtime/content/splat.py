@@ -88,9 +88,7 @@ class SplatSource(CanvasSource):
         quads = np.arange(count, dtype=np.int32)[:, None] * 4 + np.array([0, 1, 2, 2, 1, 3], np.int32)
         indices = context.buffer(np.ascontiguousarray(quads).tobytes())
         self._vertices = context.vertex_array(
-            self._program,
-            [(self._buffer, "2f 2f 4f", "in_place", "in_deviations", "in_colour")],
-            index_buffer=indices,
+            self._program, [(self._buffer, "2f 2f 4f", "in_place", "in_deviations", "in_colour")], index_buffer=indices
         )
         self.held += [self._program, self._buffer, indices, self._vertices]
 

@@ -59,11 +59,7 @@ def _read(path: Path) -> str:
             )
         token = (opened.read(MOST_BYTES) or b"").decode("ascii", "replace").strip()
     if len(token) < LEAST_CHARACTERS or not token.isprintable() or " " in token:
-        raise InputError(
-            path,
-            "",
-            f"must contain a token of at least {LEAST_CHARACTERS} characters on one line",
-        )
+        raise InputError(path, "", f"must contain a token of at least {LEAST_CHARACTERS} characters on one line")
     return token
 
 

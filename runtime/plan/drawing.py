@@ -117,12 +117,7 @@ def _nearness(
 
 
 def _relief(
-    depths: Sequence[F32 | None],
-    views: Sequence[View],
-    stack: PanelStack,
-    window: SolveWindow | None,
-    *,
-    every: int,
+    depths: Sequence[F32 | None], views: Sequence[View], stack: PanelStack, window: SolveWindow | None, *, every: int
 ) -> F32 | None:
     """Return the relief, on the middle panel, of the content drawn for all views, or None if a depth is unknown.
     `depths` are each view's inverse distances (`_nearness`), in the window that was drawn, if not the whole panel was.

@@ -16,14 +16,7 @@ from runtime.errors import InputError
 from runtime.records import U8
 from runtime.support.artifacts import held_back
 from runtime.support.coded_colours import Colour, composed, stated_profile
-from runtime.support.picture_header import (
-    ORIENTATION,
-    check_size,
-    is_cut_off,
-    opened,
-    read_coded,
-    undecodable,
-)
+from runtime.support.picture_header import ORIENTATION, check_size, is_cut_off, opened, read_coded, undecodable
 from runtime.support.untrusted_input import LIMITS
 
 log = logging.getLogger("phasestack.pictures")

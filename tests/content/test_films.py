@@ -131,10 +131,7 @@ def test_streams_of_different_sizes_are_not_views(tmp_path: Path) -> None:
     assert played(path, [0]) == pytest.approx([40], abs=4)
 
 
-@pytest.mark.parametrize(
-    ("name", "codec", "pix_fmt"),
-    [("a.webm", "libvpx-vp9", "yuva420p"), ("a.mov", "png", "rgba")],
-)
+@pytest.mark.parametrize(("name", "codec", "pix_fmt"), [("a.webm", "libvpx-vp9", "yuva420p"), ("a.mov", "png", "rgba")])
 def test_a_transparent_film_is_shown_over_the_background(tmp_path: Path, name: str, codec: str, pix_fmt: str) -> None:
     picture = np.dstack([grey(250), np.repeat([[0] * 32 + [255] * 32], 48, 0)]).astype(np.uint8)
     path = write(tmp_path / name, [(0, picture), (100, picture)], codec=codec, pix_fmt=pix_fmt)

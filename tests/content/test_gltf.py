@@ -179,11 +179,7 @@ def test_a_skin_has_the_pose_of_its_nodes(tmp_path: Path) -> None:
     back = np.eye(4)
     back[3, 0] = -1.0  # column by column: the second joint was bound at x = 1
     skins = [{"joints": [1, 2], "inverseBindMatrices": b.add([np.eye(4), back])}]
-    nodes = [
-        {"mesh": 0, "skin": 0, "translation": [50, 0, 0]},
-        {"children": [2]},
-        {"translation": [4, 0, 0]},
-    ]
+    nodes = [{"mesh": 0, "skin": 0, "translation": [50, 0, 0]}, {"children": [2]}, {"translation": [4, 0, 0]}]
     scenes = [{"nodes": [0, 1]}]
     data = load_mesh(b.write(tmp_path / "a.gltf", primitive, nodes=nodes, skins=skins, scenes=scenes, materials=[{}]))
     assert data.low[0] == -1 and data.high[0] == pytest.approx(1 - 1 + 4)
@@ -202,13 +198,7 @@ def test_a_skin_may_name_more_than_four_joints_per_vertex(tmp_path: Path) -> Non
     assert (data.low[0], data.high[0]) == (pytest.approx(-1 + 2), pytest.approx(1 + 2))
 
 
-@pytest.mark.parametrize(
-    "hidden",
-    [
-        {"scale": [0, 0, 0]},
-        {"extensions": {"KHR_node_visibility": {"visible": False}}},
-    ],
-)
+@pytest.mark.parametrize("hidden", [{"scale": [0, 0, 0]}, {"extensions": {"KHR_node_visibility": {"visible": False}}}])
 def test_hidden_objects_do_not_count_in_the_fit(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, hidden: dict[str, Any]
 ) -> None:

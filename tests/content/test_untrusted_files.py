@@ -277,10 +277,7 @@ GLTFS: dict[str, tuple[dict[str, Any], str]] = {
         gltf(buffers=[{"byteLength": 48, "uri": "a" * 300}]),
         "uri: is not a valid path: File name too long",
     ),
-    "an address": (
-        gltf(buffers=[{"byteLength": 48, "uri": "http://localhost/a.bin"}]),
-        "is not a local file",
-    ),
+    "an address": (gltf(buffers=[{"byteLength": 48, "uri": "http://localhost/a.bin"}]), "is not a local file"),
     "an absolute path": (gltf(buffers=[{"byteLength": 48, "uri": "/etc/passwd"}]), "is an absolute path"),
     "a device": (gltf(buffers=[{"byteLength": 48, "uri": "zero.bin"}]), "uri: is a device"),
     "a missing texture": (textured(0, [{"source": 0}], [{"uri": "gone.png"}]), "uri: gone.png does not exist"),
@@ -301,10 +298,7 @@ GLTFS: dict[str, tuple[dict[str, Any], str]] = {
         "extensionsRequired: EXT_meshopt_compression: meshopt is not supported; save the model without",
     ),
     "an extension": (gltf(extensionsRequired=["ADOBE_x"]), "extensionsRequired: ADOBE_x is not supported"),
-    "an older version": (
-        gltf(asset={"version": "1.0"}),
-        "asset.version: is 1.0, which is not supported; convert it",
-    ),
+    "an older version": (gltf(asset={"version": "1.0"}), "asset.version: is 1.0, which is not supported; convert it"),
     "an accessor beyond its view": (
         gltf(accessors=[{"bufferView": 0, "componentType": 5126, "count": 99, "type": "VEC3"}] * 2),
         "is damaged or is not glTF: an accessor extends beyond its buffer view",
@@ -355,10 +349,7 @@ def test_a_mesh_reads_nothing_outside_its_folder(tmp_path: Path, suffix: str, na
         ("a.usdz", "is a USD scene (.usdz), which is not supported; export it as glTF"),
         ("a.3mf", "is a CAD or 3D-print model (.3mf), which is not supported; export it as STL or glTF"),
         ("a.xyz", "is a point cloud (.xyz), which is not supported; save it as PLY"),
-        (
-            "a.LCC",
-            "is a compressed splat file (.lcc), which is not supported; convert it with `npx @playcanvas",
-        ),
+        ("a.LCC", "is a compressed splat file (.lcc), which is not supported; convert it with `npx @playcanvas"),
         ("a.wmv", "is a film (.wmv), which is not supported; convert it with `ffmpeg -i in.wmv out.mp4`"),
         ("a.glb", "is a Git LFS pointer; fetch the file itself with `git lfs pull`"),
         ("a.ply", "is a Git LFS pointer"),
@@ -390,11 +381,7 @@ def test_json_of_too_many_values_is_refused_before_it_is_parsed(
 def test_files_beside_an_obj_are_read_only_if_they_are_files(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "fifo.png")
     (tmp_path / "a.obj").write_text("mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl a\nf 1 2 3\n")
-    for line, told in (
-        ("map_Kd fifo.png", "is a FIFO"),
-        ("map_Kd /etc/passwd", "absolute"),
-        ("map_Kd a\0b", "NUL"),
-    ):
+    for line, told in (("map_Kd fifo.png", "is a FIFO"), ("map_Kd /etc/passwd", "absolute"), ("map_Kd a\0b", "NUL")):
         (tmp_path / "a.mtl").write_text(f"newmtl a\n{line}\n")
         assert told in refused(tmp_path / "a.obj")
 

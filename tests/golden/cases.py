@@ -134,11 +134,7 @@ CASES = {
     "fault": Case("lean", {}, {25: break_model, 50: mend_model}, pictures=(48, 70)),
     "four-panels": Case(
         "lean",
-        {
-            "stack": {"x_m": (-0.05, -0.02, 0.01, 0.05)},
-            "content": {"scene": "demo"},
-            "output": {"panels": MOUNTED},
-        },
+        {"stack": {"x_m": (-0.05, -0.02, 0.01, 0.05)}, "content": {"scene": "demo"}, "output": {"panels": MOUNTED}},
         pictures=(50,),
     ),
     "two-people": Case(
