@@ -395,7 +395,8 @@ class LoopSettings(Section):
     )
     scanout_ms: Annotated[float, within(0.0, 1000.0, "ms")] = Field(
         8.0,
-        description="delay from the buffer swap to the midpoint of the interval during which the panels show the frame",
+        description="delay from the buffer swap to the midpoint of the interval during which the panels show the "
+        "frame, plus their response's time constant",
     )
     simulated_stage_ms: Annotated[dict[str, NonNegative], AfterValidator(_check_stages)] = Field(
         default_factory=lambda: {
