@@ -151,15 +151,13 @@ def step(
     *,
     size: float | Tensor,
     momentum: float | Tensor = MOMENTUM,
-    floor: float = FLOOR,
     grey: Sequence[int] = (),
 ) -> tuple[Tensor, Tensor]:
     """Compute one solver step from (L5): the new panel values x' (N, C, H, W) and their extrapolation y'.
 
     `y` is extrapolated from x by the previous step's momentum; initially it equals x. If the targets (V, C, h, w) of
-    the views have k times as many rows as the rays, the sets take k turns, and each uses every k-th row. `floor` limits
-    the curvature per set of rays. Panels in `grey` have one value for all channels: their gradient and curvature are
-    means over the channels.
+    the views have k times as many rows as the rays, the sets take k turns, and each uses every k-th row. Panels in
+    `grey` have one value for all channels: their gradient and curvature are means over the channels.
     """
     sets, turns = len(views.panels_from_rays), targets.shape[-2] // views.height_px
     back, size_px = torch.linalg.inv(views.panels_from_rays), y.shape[-2:]
@@ -175,7 +173,7 @@ def step(
         gradient, curvature = gradient + g, curvature + d
     for n in grey:
         gradient[n], curvature[n] = gradient[n].mean(dim=0), curvature[n].mean(dim=0)
-    new = (y - size * 2 / (torch.pi * len(y)) * gradient / curvature.clamp(min=floor * sets)).clamp(0, 1)
+    new = (y - size * 2 / (torch.pi * len(y)) * gradient / curvature.clamp(min=FLOOR * sets)).clamp(0, 1)
     return new, new + momentum * (new - x)
 
 

@@ -46,7 +46,6 @@ class LivePicture:
 
     number: int  # increases with each picture
     rgb: U8  # (h, w, 3), with every view in the layout
-    taken_s: float  # on the monotonic clock
     pixel_aspect: float = 1.0  # pixel width divided by pixel height
     pointer: tuple[float, float] | None = None  # place of a mouse pointer to draw, as fractions of width and height
 
@@ -79,7 +78,7 @@ class Feed(ABC):
     def _take(self, rgb: U8, pixel_aspect: float = 1.0, pointer: tuple[float, float] | None = None) -> None:
         self._count += 1
         self._seen_s = time.monotonic()
-        self.newest = LivePicture(self._count, rgb, self._seen_s, pixel_aspect, pointer)
+        self.newest = LivePicture(self._count, rgb, pixel_aspect, pointer)
         self.problem = ""
 
     def state(self) -> str:
