@@ -53,6 +53,7 @@ WIDTH_PX, LIMIT_BYTES = 1200, 200_000
 WRAPPED = 120  # characters per line of text
 FILM_BYTES, FILM_PX, FILM_EVERY = 1_500_000, (400, 225), 4  # size limit, picture size, refreshes per film frame
 FILM_S = 2.0, 8.0  # the film's start and end within the run
+PEOPLE_PX = 320, 180  # size of each eye's picture in the film of two people
 PICTURES = {  # name in docs/images: path in the work folder
     "boards.jpg": "boards.png",
     "kinds.jpg": "kinds.png",
@@ -260,6 +261,30 @@ def leaning(folder: Path) -> None:
     save_film(frames, folder / "leaning.webp", period_ms=1000 * FILM_EVERY / settings.loop.rate_hz)
 
 
+def two_people(folder: Path) -> None:
+    """Write the film `two-people.webp`: what four eyes see of four panels while one person sits and one leans."""
+    recording = folder / "two.mcap"
+    write_motion(recording, "two-one-leans", seconds=FILM_S[1], seed=SEED, noise_mm=NOISE_MM)
+    settings = settings_for(recording, scene="room", effort="auto")
+    settings = changed(settings, "stack", {"x_m": (-0.09, -0.03, 0.03, 0.09)}, source="gallery")
+    run, scale = KeptInMemory(), 0.25
+    simulated_run(settings, scale=scale, keep_light=FILM_EVERY, output=run)
+    stack, frames, (width, height) = scaled_stack(settings, scale), [], PEOPLE_PX
+    for frame, (info, _) in run.true.items():
+        eyes = [(person, eye_m) for person in info["people"] for eye_m in person["true_eyes_m"]]
+        if frame < FILM_S[0] * settings.loop.rate_hz or len(eyes) < 4:
+            continue
+        sheet = Image.new("RGB", (2 * width, 2 * height))
+        for n, (person, eye_m) in enumerate(eyes):
+            seen = light_of(eye_m, run.layers[frame], stack, fov_deg=info["fov"])
+            place = n % 2 * width, n // 2 * height
+            sheet.paste(Image.fromarray(seen).resize(PEOPLE_PX, Image.Resampling.BOX), place)
+            text = f"person {person['number']}, {('left', 'right')[n % 2]} eye"
+            _label(sheet, (place[0] + 8, place[1] + 6), text)
+        frames.append(sheet)
+    save_film(frames, folder / "two-people.webp", period_ms=1000 * FILM_EVERY / settings.loop.rate_hz)
+
+
 def light_of(eye_m: F64, layers: U8, stack: PanelStack, *, fov_deg: float) -> U8:
     """Compute the picture (h, w, 3) of the layers as seen by an eye, averaged over the pupil.
 
@@ -330,8 +355,12 @@ def main() -> None:
     boards().save(arguments.work / "boards.png")
     look_into(arguments.work / "look")
     leaning(arguments.work / "look")
+    two_people(arguments.work / "look")
     files = {name: smaller(arguments.work / source, name) for name, source in PICTURES.items()}
-    files |= {name: (arguments.work / "look" / name).read_bytes() for name in ("leaning.webp", "viewer.html")}
+    files |= {
+        name: (arguments.work / "look" / name).read_bytes()
+        for name in ("leaning.webp", "two-people.webp", "viewer.html")
+    }
     text = page(json.loads((arguments.work / "report" / "report.json").read_text(encoding="utf-8")))
     for name, data in files.items():
         (IMAGES / name).write_bytes(data)
