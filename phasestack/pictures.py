@@ -115,7 +115,7 @@ def _advice_on_type(name: str, picture: Any) -> str:
     if picture.dtype == np.bool_:
         return f"; pass {name} * np.uint8(255)"
     if picture.min() >= 0 and picture.max() <= 255:
-        return f"; pass {name}.astype(np.uint8)"
+        return f"; pass np.asarray({name}, np.uint8)"
     return (
         f"; if white is 65535, pass {name} / 65535" if picture.dtype == np.uint16 else "; divide by the value of white"
     )

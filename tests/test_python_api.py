@@ -137,7 +137,7 @@ def test_pictures_are_codes_or_intensities_with_or_without_transparency() -> Non
     [
         ({"left": np.zeros((180, 320))}, "left"),
         ({"right": picture()[:90]}, "right"),
-        ({"right": picture().astype(np.int32)}, r"right: .*right\.astype\(np\.uint8\)"),
+        ({"right": picture().astype(np.int32)}, r"right: .*np\.asarray\(right, np\.uint8\)"),
         ({"left": picture().astype(np.float64)}, "left"),
         ({"eyes_m": (0.7, 0.0, 0.0)}, "eyes_m"),
         ({"eyes_m": ((0.05, -0.03, 0.0), (0.05, 0.03, 0.0))}, "eyes_m"),

@@ -77,8 +77,9 @@ def test_what_rounding_makes_of_white_and_black_is_white_and_black() -> None:
 @pytest.mark.parametrize(
     ("given", "advice"),
     [
-        (CODES.astype(np.uint16), "left.astype(np.uint8)"),
-        (CODES.astype(np.int64), "left.astype(np.uint8)"),
+        (CODES.astype(np.uint16), "np.asarray(left, np.uint8)"),
+        (CODES.astype(np.int64), "np.asarray(left, np.uint8)"),
+        (CODES.tolist(), "np.asarray(left, np.uint8)"),
         (CODES.astype(np.uint16) * 257, "left / 65535"),
         (CODES.astype(np.float32), "np.clip(left / 255, 0, 1)"),
         (CODES * 1.1 - 10, "np.clip(left / 255, 0, 1)"),
