@@ -229,6 +229,17 @@ def test_colour_filters_pass_a_third_of_the_open_area_each() -> None:
     assert seen.brightness == pytest.approx(0.6**3 / 3, rel=0.05)
 
 
+@pytest.mark.parametrize("filters", [(False, False, False), (True, False, True)])
+def test_black_lines_block_rays_and_leave_the_others_as_they_are(filters: tuple[bool, ...]) -> None:
+    layers, across = smooth_layers(), np.linspace(-0.04, 0.04, 500)
+    through = np.stack([np.zeros_like(across), across, np.full_like(across, 1.5e-4)], -1)
+    crossed = crossings(MIDDLE.repeat(len(across), 0), through, STACK, RealPanels(), random())
+    light, white = Tables(layers, STACK, RealPanels(optics=Optics(filters=filters, aperture=0.5))).light(crossed, 0.6)
+    ideal = Tables(layers, STACK, RealPanels()).light(crossed, 0.6)[0]
+    assert 0 < white.mean() < 0.5
+    assert light == pytest.approx(white * ideal)
+
+
 def test_light_behind_a_slit_spreads_as_sinc_squared() -> None:
     orders = diffraction_orders(random().random(400_000))
     assert np.mean(np.abs(orders) < 1) == pytest.approx(0.9028 / 0.9833, abs=0.003)  # main lobe, of that within 6

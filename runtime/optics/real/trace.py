@@ -154,13 +154,22 @@ class Tables:
         """Return each ray's light (P, 3), and its light through white panels, (P, 3) or (1, 1). `eye_x_m`,
         the eye's distance from the origin, determines how the alignment moves the layers.
         """
+        white = self._white(crossed)
+        if len(white) == 1:
+            return np.asarray(white * self._share(crossed, eye_x_m), np.float32), np.asarray(white, np.float32)
+        passes = white.any(axis=1)  # most rays meet a black line or a filter of another colour
+        light = np.zeros((len(white), 3), np.float32)
+        through = Crossings(crossed.u[:, passes], crossed.v[:, passes], crossed.slope[..., passes])
+        light[passes] = white[passes] * self._share(through, eye_x_m)
+        return light, np.asarray(white, np.float32)
+
+    def _share(self, crossed: Crossings, eye_x_m: float) -> F32:
+        """Return the share of light (P, 3) that the polarization lets through, relative to full white."""
         share = sum(
             (self._polarized(self._values(crossed, lags, eye_x_m)) for lags in self._moments),
             start=np.zeros((crossed.u.shape[1], 3), np.float32),
         ) / np.float32(len(self._moments))
-        share = self._blocked + (1 - self._blocked) * share / self._full
-        white = self._white(crossed)
-        return np.asarray(white * share, np.float32), np.asarray(white, np.float32)
+        return np.asarray(self._blocked + (1 - self._blocked) * share / self._full, np.float32)
 
     def _full_white(self) -> F32:
         """Return the light (3,) of full white in each band: the middle panel at 0, the others equal, as solved in
