@@ -12,6 +12,7 @@ import numpy as np
 
 from runtime.evaluation.displayed import EyeViews, eye_names
 from runtime.optics.carried import intensities
+from runtime.optics.focus import FocusTargets
 from runtime.optics.pupil import PUPIL_MM, TRACKING_SIGMA_MM
 from runtime.optics.retina import as_codes
 from runtime.records import F32, U8, Eyes, RefreshAccount
@@ -38,11 +39,22 @@ class Moment:
     asked_for: tuple[U8, ...]  # (h, w, 3) the solution's targets
     relief: F32 | None = None  # (h, w) relief of the solution's content (`optics.relief`)
     account: RefreshAccount | None = None  # the refresh
+    # Retina pictures of the scene and, as seen through the layers, in the same order, if the solution has focus
+    focused: tuple[FocusTargets, tuple[U8, ...]] | None = None
     state_version: int = 0  # the solver's state at the refresh (`Facts.version`)
 
 
-def contact_sheet(layers: U8, eye_views: EyeViews | None, *, headline: str, lines: Sequence[str] = ()) -> U8:
-    """Draw a sheet (h, w, 3): a row of layers, then each eye's target, retina image and error."""
+def contact_sheet(
+    layers: U8,
+    eye_views: EyeViews | None,
+    *,
+    headline: str,
+    lines: Sequence[str] = (),
+    focused: tuple[FocusTargets, tuple[U8, ...]] | None = None,
+) -> U8:
+    """Draw a sheet (h, w, 3): a row of layers, each eye's target, retina image and error, and what the left
+    eye sees as it focuses (`Moment.focused`).
+    """
     height, width = layers.shape[1:3]
     tile = (TILE_WIDTH, round(TILE_WIDTH * height / width))
     names = {0: "layer 0 (rear, at the backlight)", len(layers) - 1: f"layer {len(layers) - 1} (front)"}
@@ -62,6 +74,11 @@ def contact_sheet(layers: U8, eye_views: EyeViews | None, *, headline: str, line
                     (f"{eye}: error x {ERROR_GAIN} (black is perfect)", as_codes(error)),
                 ]
             )
+    if focused is not None:
+        scene, through = focused
+        for name, pictures in (("seen through the layers", through), ("the scene's own", scene.pictures)):
+            focus = [f"left eye focused at {1000 * plane_m:+.0f} mm" for plane_m in scene.planes_m]
+            rows.append([(f"{where}: {name}", left) for where, left in zip(focus, pictures[::2], strict=True)])
     columns = max(len(row) for row in rows)
     lines = [part for line in lines for part in wrap(line, LINE_LETTERS * columns)]
     cell = (tile[0] + MARGIN, tile[1] + MARGIN + TITLE)

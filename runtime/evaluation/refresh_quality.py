@@ -11,6 +11,7 @@ import numpy as np
 from runtime.evaluation.contact_sheet import Moment
 from runtime.evaluation.displayed import EyeViews, displayed
 from runtime.optics.carried import PLENTY, carried_db, expected_psnrs_db, intensities
+from runtime.optics.focus import FocusTargets
 from runtime.optics.light import Sampling, squared_errors
 from runtime.optics.pupil import TRACKING_SIGMA_MM
 from runtime.optics.quality import Quality
@@ -36,6 +37,7 @@ class RefreshTargets:
     solved: Pictures | None = None  # content at the solution's instant, for the eyes it was solved for
     used: Pictures | None = None  # content at the solution's instant, for the eyes the layers were aligned to
     true: Pictures | None = None  # content at the display time, for the true eyes
+    focused: FocusTargets | None = None  # content at the solution's instant, for focusing eyes that it was solved for
 
 
 @dataclass(frozen=True, slots=True)

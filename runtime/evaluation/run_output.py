@@ -136,8 +136,9 @@ class RunOutput:
                 moment.eye_views.write(folder)
                 asked_for = replace(moment.eye_views, wanted=moment.asked_for, eyes_m=moment.solved_for_m)
                 page = asked_for.viewer(moment.solution, [title, *lines], relief=moment.relief)
-            views = None if moment is None else moment.eye_views
-            write_png(folder / "contact-sheet.png", contact_sheet(shown, views, headline=title, lines=lines))
+            views, focused = (None, None) if moment is None else (moment.eye_views, moment.focused)
+            sheet = contact_sheet(shown, views, headline=title, lines=lines, focused=focused)
+            write_png(folder / "contact-sheet.png", sheet)
             write_text(folder / "viewer.html", page)
 
         self._work.put((lambda: None, lambda: self._attempt(write)))  # also after a failure

@@ -94,6 +94,8 @@ class RunObserver:
             last = self.last
             if last is not None and self._measures and has_picture(last) and last.account.eyes_m is not None:
                 self._sampler.finish(last)
+        if self._measures and self.last is not None and not stopped():
+            self._sampler.measure_retina(self.last)
 
     def live(self) -> dict[str, Any]:
         """Return the live quality measured so far, for the daemon's status (docs/contracts.md, Error)."""

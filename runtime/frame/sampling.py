@@ -27,9 +27,12 @@ from runtime.evaluation.refresh_quality import (
     solved_eyes_of,
     true_eyes_of,
 )
+from runtime.frame.messages import Wanted
 from runtime.frame.refresh import Refresh
 from runtime.frame.targets import TargetDrawer
 from runtime.frame.truth import TrueEyes
+from runtime.optics.carried import intensities
+from runtime.optics.focus import retina_db
 from runtime.optics.presentation import shown_layers
 from runtime.optics.quality import psnr_db
 from runtime.optics.stack import PanelStack
@@ -42,7 +45,7 @@ MEASURING_SHARE = 0.1  # largest share of a real-time run spent on measuring
 LIVE_SHARE = 0.3  # the same for a live page, whose measurements take a third of the time
 MEASURED_WITHIN_S = 60.0  # timeout for measuring the queued refreshes after the run
 LOOK_S = 0.02  # interval for checking whether the queue is done
-DRAWN_WITHIN_S = 10.0  # timeout for drawing the last refresh's target pictures
+DRAWN_WITHIN_S = 30.0  # timeout for drawing the last refresh's target pictures
 MOVED_M = 0.002  # a figure applies until an eye has moved this far, about twice a tracker's error
 REST_S = 0.3  # how long the eyes must rest before a live page's refresh is measured again
 SETTLED_S = 1.0  # once a solution has been shown for this long, figures of earlier ones no longer apply
@@ -85,6 +88,7 @@ class QualitySampler:
         self._job: BackgroundJob[RefreshQuality] | None = None
         self._job_frame = self._moment_frame = -1
         self._samples = 0
+        self.retina_db: float | None = None  # of the last refresh's solution (docs/contracts.md, Error)
         self._drawing = False
         self._began_s = self._resumes_s = 0.0  # when the latest measurement began, and when the next may begin
 
@@ -177,18 +181,34 @@ class QualitySampler:
 
     def finish(self, last: Refresh) -> None:
         """Measure the last refresh, which counts towards the means only if no other one was measured."""
-        drawn: list[RefreshTargets | None] = []
         account = self._truth.of(last.account)
-        self._drawer.draw(self._wanted(last, account), None, drawn.append)
+        quality = self._compared(last, account, self._drawn(self._wanted(last, account)))
+        counts = not self.measured and last.account.state is State.TRACKING
+        self._take(last.account.frame, quality, figures=counts, live=not self.live)
+
+    def measure_retina(self, last: Refresh) -> None:
+        """Measure the retina pictures of the last refresh's solution, if its content might get focus."""
+        solution = last.solution
+        if solution is None or solution.solved_for_m is None or not (is_measurable(last) and self._drawer.may_focus):
+            return
+        targets = self._drawn({"focused": (solution.solved_for_m, solution.solved_for_ns)})
+        if targets is None or targets.focused is None:
+            return
+        focused, unaligned = targets.focused, replace(last.frame, parallax=None, solved_from_shown=())
+        seen = focused.seen(shown_layers(unaligned), self._stack)
+        self.retina_db = retina_db(zip(seen, map(intensities, focused.pictures), strict=True))
+        if self.moment is not None and solution.effort is not None and solution.effort.focus:
+            self.moment = replace(self.moment, focused=(focused, tuple(retina.codes() for retina in seen)))
+
+    def _drawn(self, wanted: Wanted) -> RefreshTargets | None:
+        """Have target pictures drawn after the run, and wait for them. None if they cannot be drawn in time."""
+        drawn: list[RefreshTargets | None] = []
+        self._drawer.draw(wanted, None, drawn.append)
         ends_s = time.monotonic() + DRAWN_WITHIN_S
         while not drawn and not self._simulated and time.monotonic() < ends_s:
             time.sleep(LOOK_S)
             self._drawer.look()
-        if not drawn:
-            return
-        quality = self._compared(last, account, drawn[0])
-        counts = not self.measured and last.account.state is State.TRACKING
-        self._take(last.account.frame, quality, figures=counts, live=not self.live)
+        return drawn[0] if drawn else None
 
     def _begin(self, sample: _Sample) -> None:
         refresh, frame = sample.refresh, sample.refresh.account.frame
@@ -275,7 +295,8 @@ class QualitySampler:
             name: round(float(np.mean(self.measured[name])), 3) if name in self.measured else None for name in FIGURES
         }
         counts = {"quality_frames": len(self.measured.get("psnr_db", [])), "live_frames": len(self.live)}
-        return {"live_db": self.live_db, **means, **counts}
+        retina = self.retina_db
+        return {"live_db": self.live_db, **means, "retina_db": None if retina is None else round(retina, 3), **counts}
 
 
 def has_picture(refresh: Refresh) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
+from typing import Any
 
 from runtime.content.base import ContentSource
 from runtime.errors import ContentFailure
@@ -12,6 +13,7 @@ from runtime.frame.messages import Answer, Draw, Drawn, Wanted
 from runtime.frame.solver_host import SolverHost
 from runtime.optics.stack import PanelStack
 from runtime.plan.drawing import retina_pictures
+from runtime.plan.focusing import focus_targets, may_focus
 
 
 class TargetDrawer:
@@ -30,6 +32,12 @@ class TargetDrawer:
     def scene(self) -> int:
         """The current scene's number, which changes when it is replaced or moved."""
         return self._solver.facts.scene
+
+    @property
+    def may_focus(self) -> bool:
+        """True if the current content might get pictures for points of the pupils."""
+        facts = self._solver.facts
+        return may_focus(facts.info, facts.settings.content.focus)
 
     def draw(self, wanted: Wanted, scene: int | None, then: Callable[[RefreshTargets | None], None]) -> None:
         """Have the wanted pictures drawn for a scene's number, by default the present one, and pass them to
@@ -52,8 +60,10 @@ def drawn(order: Draw, content: ContentSource, *, scene: int, stack: PanelStack)
     if order.scene not in (None, scene):
         return Drawn(order.number, None)
     with suppress(ContentFailure):
-        pictures = {
-            name: retina_pictures(content, eyes_m, stack, fov_deg=order.fov_deg, time_ns=time_ns)
+        pictures: dict[str, Any] = {
+            name: focus_targets(content, eyes_m, stack, time_ns=time_ns)
+            if name == "focused"
+            else retina_pictures(content, eyes_m, stack, fov_deg=order.fov_deg, time_ns=time_ns)
             for name, (eyes_m, time_ns) in order.wanted.items()
         }
         return Drawn(order.number, RefreshTargets(order.fov_deg, **pictures))

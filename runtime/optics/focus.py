@@ -27,11 +27,13 @@ SOLVED_POINTS_M = ((0.0, 0.0), (0.0012, 0.0), (-0.0012, 0.0), (0.0, 0.0012), (0.
 
 @dataclass(frozen=True, slots=True)
 class RetinaPixels:
-    """Pixels of a retina picture: the middle panel's, or a part of them, as the eye sees them. Smaller ones would show
-    the panels' own pixels in every picture, whether the eye can focus or not.
+    """Pixels of a retina picture: the middle panel's, or a part of them, as the eye sees them.
+
+    With smaller ones, the panels' own pixels would dominate the error, whether the eye can focus or not.
     """
 
     raster: PlaneRaster  # in the plane of the middle panel
+    every: int = 1  # only every n-th pixel of every n-th row is in the picture
 
     def on_plane(self, eye_m: F64, plane_m: float) -> PlaneRaster:
         """Return the pixels projected from an eye at (3,) in `stack` onto the plane x = `plane_m`."""
@@ -56,7 +58,10 @@ class RetinaPixels:
 
     def seen(self, layers: U8, stack: PanelStack, eye_m: F64, *, plane_m: float) -> Retina:
         """Compute the retina picture of an eye that looks through layers and focuses on x = `plane_m`."""
-        u, v = (np.arange(count, dtype=np.float64) + 0.5 for count in (self.raster.width_px, self.raster.height_px))
+        u, v = (
+            np.arange(0, count, self.every, dtype=np.float64) + 0.5
+            for count in (self.raster.width_px, self.raster.height_px)
+        )
         panels = [stack.panel(index) for index in range(stack.count)]
         mask = np.ones((len(v), len(u)), bool)
 
@@ -73,7 +78,26 @@ class RetinaPixels:
         """Return the (h, w, 3) retina picture of an eye that looks at a scene and focuses on x = `plane_m`.
         `picture_of` draws the picture from a point (3,) of the pupil through a projection.
         """
-        return average(picture_of(point, matrix) for point, matrix in self.projections(eye_m, plane_m=plane_m))
+        drawn = (picture_of(point, matrix) for point, matrix in self.projections(eye_m, plane_m=plane_m))
+        return average(picture[:: self.every, :: self.every] for picture in drawn)
+
+
+@dataclass(frozen=True, slots=True)
+class FocusTargets:
+    """A scene's own retina pictures of two eyes that focus on its front, its middle and its rear."""
+
+    pixels: RetinaPixels
+    eyes_m: F64  # (2, 3) frame `stack`
+    planes_m: tuple[float, ...]  # x of the planes in focus, frame `stack`
+    pictures: tuple[U8, ...]  # (h, w, 3) those of the left and right eye for each plane in turn
+
+    def seen(self, layers: U8, stack: PanelStack) -> list[Retina]:
+        """Compute the retina pictures of the same eyes, focused likewise, that look through layers."""
+        return [
+            self.pixels.seen(layers, stack, eye_m, plane_m=plane_m)
+            for plane_m in self.planes_m
+            for eye_m in self.eyes_m
+        ]
 
 
 def retina_db(pictures: Iterable[tuple[Retina, F32]]) -> float:

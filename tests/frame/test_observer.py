@@ -22,10 +22,12 @@ from runtime.frame.refresh import Refresh
 from runtime.frame.targets import TargetDrawer, drawn
 from runtime.model.predictor import Predictor
 from runtime.optics.alignment import align
-from runtime.optics.carried import carried_db, expected_psnrs_db
+from runtime.optics.carried import carried_db, expected_psnrs_db, intensities
+from runtime.optics.focus import retina_db
 from runtime.optics.presentation import shown_layers
 from runtime.plan.drawing import drawn_job, retina_pictures
-from runtime.records import PanelFrame, RefreshAccount, SensorFrame, Solution, State
+from runtime.plan.focusing import focus_targets, focused_job
+from runtime.records import Effort, PanelFrame, RefreshAccount, SensorFrame, Solution, State
 from runtime.support.background import wait_for_all
 from tests.frame.conftest import SMALL
 from tests.frame.fakes import EYES, FakeSolver, aside, facts
@@ -63,10 +65,11 @@ class Drawing(FakeSolver):
     def __init__(self, content: Any, *, at_once: bool = True) -> None:
         super().__init__()
         self.content, self.at_once, self.scene, self.fov_deg = content, at_once, 1, FOV_DEG
+        self.focus = "off"
 
     @property
     def facts(self) -> Facts:
-        settings = Settings.model_validate({"content": {"fov_deg": self.fov_deg}})
+        settings = Settings.model_validate({"content": {"fov_deg": self.fov_deg, "focus": self.focus}})
         return facts(settings, scene=self.scene)
 
     def _dispatch(self, order: Order) -> None:
@@ -179,8 +182,8 @@ def test_nothing_measured_is_null(content: ContentSource, solved: Solution) -> N
     observer.finish()
     assert observer.summary() == {
         "live_db": None, "view_error_mm": None, "light_db": None, "psnr_db": None, "ssim": None, "carried_db": None,
-        "psnr_db_true_eyes": None, "carried_db_true_eyes": None, "quality_frames": 0, "live_frames": 0,
-        "people": [],
+        "psnr_db_true_eyes": None, "carried_db_true_eyes": None, "retina_db": None,
+        "quality_frames": 0, "live_frames": 0, "people": [],
     }  # fmt: skip
     assert observer.moment is None
 
@@ -204,6 +207,41 @@ def test_quality_is_measured_at_the_eyes_used_and_at_the_true_ones(content: Cont
     assert (summary["psnr_db"], summary["carried_db"]) == pytest.approx(psnr(used), abs=0.001)
     assert (summary["psnr_db_true_eyes"], summary["carried_db_true_eyes"]) == pytest.approx(psnr(true), abs=0.001)
     assert summary["quality_frames"] == 1
+
+
+@pytest.mark.parametrize("focus", [False, True])
+def test_the_last_solution_s_retina_is_measured_if_focus_is_on(
+    predictor: Predictor, content: ContentSource, solved: Solution, focus: bool
+) -> None:
+    solver = Drawing(content)
+    solver.focus = "on"
+    if focus:
+        job = focused_job(content, drawn_job(predictor, content, EYES, time_ns=0), time_ns=0, focus="on")
+        assert job is not None
+        solved = replace(solved, layers=predictor.solve(job).layers.copy(), effort=Effort(1, 16, focus=True))
+    observer, _ = looking(content, solver=solver, evaluate_every=1)
+    observer.refreshed(refresh(1, solved))
+    observer.finish()
+    targets = focus_targets(content, EYES, SMALL, time_ns=0)
+    assert targets is not None and len(targets.pictures) == 6
+    front_m, middle_m, rear_m = targets.planes_m
+    assert front_m > middle_m > rear_m
+    seen = targets.seen(solved.layers, SMALL)
+    expected_db = retina_db(zip(seen, map(intensities, targets.pictures), strict=True))
+    assert observer.summary()["retina_db"] == pytest.approx(expected_db, abs=0.001)
+    assert expected_db > 20
+    assert observer.moment is not None and (observer.moment.focused is not None) == focus
+
+
+def test_content_without_depth_has_no_retina_pictures() -> None:
+    class Flat(ContentSource):
+        def __init__(self) -> None:
+            self.info = ContentInfo("flat")
+
+        def render(self, view: View, *, time_ns: int) -> Any:
+            return np.full((view.height_px, view.width_px, 4), 90, np.uint8)
+
+    assert focus_targets(Flat(), EYES, SMALL, time_ns=0) is None
 
 
 def test_every_so_many_refreshes_are_sampled_while_tracking_and_no_others(
