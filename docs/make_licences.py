@@ -49,7 +49,7 @@ def locked() -> dict[str, str]:
 def licences(names: list[str]) -> list[dict[str, str]]:
     """Return installed packages' `Name`, `Version`, `License` and `URL` entries, sorted by name."""
     command = [
-        Path(sys.executable).parent / "pip-licenses",
+        str(Path(sys.executable).parent / "pip-licenses"),
         "--from=mixed",
         "--with-urls",
         "--format=json",

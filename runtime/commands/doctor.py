@@ -281,7 +281,7 @@ def _rate(predictor: Predictor, backend: SolverBackend, settings: Settings) -> R
 
     stack = predictor.stack
     raster = f"{stack.width_px}x{stack.height_px}"
-    if predictor.on_panels(stack) is None:
+    if not predictor.has_devices:
         return Row("rate", "skip", f"cannot time the model {predictor.name}")
     coarse = replace(stack, width_px=max(64, stack.width_px // 4), height_px=max(64, stack.height_px // 4))
     took_ms, how = (

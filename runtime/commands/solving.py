@@ -139,10 +139,10 @@ def solve_pictures(
             return created
 
         predictor = load_predictor(model, stack, settings)
-        cleanup.callback(predictor.close)
         # A few solutions take less time than it would take to time both backends.
         device = "cpu" if settings.backend == "auto" and repeat < MEASURED_FROM else settings.backend
-        predictor.set_backend(choose(device, predictor, context).backend)
+        predictor = predictor.bound(backend=choose(device, predictor, context).backend)
+        cleanup.callback(predictor.close)
         watch.lap("load model")
         inference_ms: list[float] = []
 

@@ -115,14 +115,13 @@ class Reconfiguration:
             try:
                 if predictor is not None:
                     undo.callback(predictor.close)
-                    changes["predictor"] = predictor
                 if opener is not None:
                     changes["content"] = opener(context=context)
                     undo.callback(changes["content"].close)
                     if moved:
                         changes["content"] = placed_source(changes["content"], placing_of(placed))
                 if predictor is not None:
-                    predictor.set_backend(backend)
+                    changes["predictor"] = predictor.bound(backend=backend)
             except PhasestackError as error:
                 self.problem = str(error)
                 return
@@ -130,6 +129,8 @@ class Reconfiguration:
                 self.problem = f"{self.settings.content.scene}: {written(error)}"
                 return
             undo.pop_all()
+            if predictor is not None:
+                predictor.close()  # it was warmed up on the processor
         before = cell.replace(**changes)
         if opener is not None:
             before.content.close()
@@ -145,7 +146,7 @@ def ready_predictor(
     """
     predictor = load_predictor(settings.model.name, stack, settings.model)
     if slots is not None:
-        predictor.write_to(slots)
+        predictor = predictor.bound(slots=slots)
     try:
         if warmed:
             predictor.warm_up(trial_eyes_m(stack))

@@ -79,17 +79,18 @@ class RunningSolver:
             if context is None:
                 context = offscreen_context()
                 undo.callback(context.release)
-            predictor = ready_predictor(settings, stack, slots=slots, warmed=setup.costs is None)
-            undo.callback(predictor.close)
+            loaded = ready_predictor(settings, stack, slots=slots, warmed=setup.costs is None)
+            undo.callback(loaded.close)
             content = opener(context=context)
             undo.callback(content.close)
             # On a simulated clock, `auto` always means the CPU, because any two runs must match byte for byte.
             device = setup.device or settings.model.backend
             device = "cpu" if setup.simulated and device == "auto" else device
-            self.backend: Choice = choose(device, predictor, lambda: context)
+            self.backend: Choice = choose(device, loaded, lambda: context)
             undo.callback(self.backend.backend.close)
-            predictor.set_backend(self.backend.backend)
+            predictor = loaded.bound(backend=self.backend.backend)
             undo.pop_all()
+            loaded.close()
         self.context = context
         self.run = SceneCell(
             settings,

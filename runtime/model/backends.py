@@ -43,7 +43,7 @@ def choose(wanted: Wanted, predictor: Predictor, context: Callable[[], Any]) -> 
     if needed. If `wanted` is `gl`, raises MissingPart without OpenGL, and InputError if a panel is too large for its
     driver.
     """
-    if predictor.on_panels(predictor.stack) is None:
+    if not predictor.has_devices:
         choice = Choice(_cpu(), f"the only backend that supports {predictor.name}")
     elif wanted == "cpu":
         choice = Choice(_cpu(), "as configured")
@@ -96,9 +96,7 @@ def _faster(predictor: Predictor, made: Callable[[], GlBackend]) -> Choice:
 
 def solution_ms(predictor: Predictor, stack: PanelStack, backend: SolverBackend, *, runs: int) -> float:
     """Return the time of the fastest of `runs` solutions, in ms, after an untimed one."""
-    solver = predictor.on_panels(stack)
-    assert solver is not None
-    solver.set_backend(backend)
+    solver = predictor.bound(stack=stack, backend=backend)
     # Assume that the eyes are known exactly, because a tracking error adds the same time on every backend.
     job = replace(drawn_job([_noise(stack, seed) for seed in (0, 1)], trial_eyes_m(stack), stack), eye_sigma_m=0.0)
     try:

@@ -54,6 +54,7 @@ class Predictor(ABC):
     precision: str = "fp32"  # precision of the network's weights and arithmetic
     stack: PanelStack  # the display's geometry
     backend: str = "cpu"  # device that runs everything except the network
+    has_devices: bool = False  # True if this device can be chosen (`bound`)
     trims: bool = False  # True if the model can solve just a window or a single channel (`trim`)
     reductions: tuple[int, ...] = (1,)  # supported rasters, given as divisors of the display's rows and columns
     steps: int = 0  # updates of all panels in a solution
@@ -68,15 +69,13 @@ class Predictor(ABC):
         """Return the model's name, with a note if its network does not serve this many views."""
         return self.name
 
-    def on_panels(self, stack: PanelStack) -> Predictor | None:
-        """Return a copy for panels of another size, to time backends, or None if the model runs on only one."""
-        return None
-
-    def set_backend(self, backend: SolverBackend) -> None:  # noqa: B027 - most have one
-        """Select what runs everything except the network from now on. Only for the thread that solves."""
-
-    def write_to(self, slots: LayerSlots) -> None:  # noqa: B027 - the layers of the others are copied
-        """Write solutions to memory shared with another process, if the model can."""
+    def bound(
+        self, *, backend: SolverBackend | None = None, stack: PanelStack | None = None, slots: LayerSlots | None = None
+    ) -> Predictor:
+        """Return the model with another device, panels of another size, or memory shared with another process for its
+        layers. A network is shared. A model without a choice of devices returns itself.
+        """
+        return self
 
     @abstractmethod
     def solve(self, job: Job, watch: Stopwatch | None = None) -> Prediction:

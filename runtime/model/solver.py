@@ -92,9 +92,10 @@ class StepPredictor(Predictor):
         name: str,
         threads: int = 2,
         backend: SolverBackend | None = None,
+        slots: LayerSlots | None = None,
     ) -> None:
         """Create a model that is shown to the user as `name`, by default on the processor. Without a proposal, the
-        panels to start from are solved on coarser rasters.
+        panels to start from are solved on coarser rasters. Layers are written to `slots`, if given.
         """
         self.stack, self.name, self._proposal, self._steps = stack, name, proposal, tuple(steps)
         self._steps_from_even = self._steps if proposal is None else steps_from_even(len(self._steps))
@@ -103,7 +104,7 @@ class StepPredictor(Predictor):
             contract = proposal.session.contract
             self.provider = proposal.session.provider
             self.parameters, self.precision = contract.parameters, contract.precision
-        self.any_raster = proposal is None or proposal.any_raster
+        self.any_raster = self.has_devices = proposal is None or proposal.any_raster
         self.trims = proposal is not None and proposal.any_raster
         self.reductions = REDUCTIONS if self.any_raster else (1,)
         self.steps = len(self._steps)
@@ -111,7 +112,7 @@ class StepPredictor(Predictor):
         self._backend: SolverBackend = backend or CpuBackend()
         self._states: dict[PanelStack, SolverState] = {}
         self._pools: dict[PanelStack, LayerPool] = {}
-        self._slots: LayerSlots | None = None
+        self._slots = slots
         # The newest solution's geometry, channels and number of steps; the state still holds its panels.
         self._improved: tuple[Geometry, int, int] | None = None
 
@@ -127,18 +128,15 @@ class StepPredictor(Predictor):
             self.name if views == 2 or self._proposal is None else f"{self.name} (without its network: needs two views)"
         )
 
-    def on_panels(self, stack: PanelStack) -> StepPredictor | None:
-        if not self.any_raster:
-            return None
-        return StepPredictor(stack, self._proposal, self._steps, name=self.name, threads=self._threads)
-
-    def set_backend(self, backend: SolverBackend) -> None:
-        self.close()
-        self._backend = backend
-
-    def write_to(self, slots: LayerSlots) -> None:
-        self.close()
-        self._slots = slots
+    def bound(
+        self, *, backend: SolverBackend | None = None, stack: PanelStack | None = None, slots: LayerSlots | None = None
+    ) -> StepPredictor:
+        other = StepPredictor(
+            stack or self.stack, self._proposal, self._steps, name=self.name, threads=self._threads,
+            backend=backend or self._backend, slots=slots or self._slots,
+        )  # fmt: skip
+        other.warmed_ms = self.warmed_ms
+        return other
 
     def solve(self, job: Job, watch: Stopwatch | None = None) -> Prediction:
         watch = watch or Stopwatch(*STAGES)

@@ -117,8 +117,8 @@ def plan_for(config: Path | None, *, scene: str | None, model: str | None, scale
         predictor = load_predictor(settings.model.name, stack, settings.model)
         backend = choose(settings.model.backend, predictor, lambda: context).backend
         cleanup.callback(backend.close)
+        predictor = predictor.bound(backend=backend)
         cleanup.callback(predictor.close)  # must be closed before its backend
-        predictor.set_backend(backend)
         measured = measure(predictor, content, eyes_m, fov_deg=settings.content.fov_deg)
         numbers = measured.numbers
         planned = make_plan(content.info, settings, eyes_m=eyes_m, measured=numbers)

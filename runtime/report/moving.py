@@ -7,11 +7,13 @@ from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from runtime.config import Settings, validated
 from runtime.daemon.build import RunOptions, build_run
 from runtime.errors import FatalError
 from runtime.evaluation.motion_recording import write_motion
+from runtime.frame.kept_light import Output
 from runtime.records import Effort
 
 SCENES = {"still": "demo", "lean": "demo", "walk": "demo", "stop-and-go": "demo", "film": "moving"}  # by motion
@@ -35,6 +37,28 @@ class Moving:
     refreshes: int  # number of refreshes measured
 
 
+def simulated_run(
+    settings: Settings,
+    *,
+    scale: float,
+    fixed: Effort | None = None,
+    keep_light: int = 0,
+    output: Output | None = None,
+) -> dict[str, Any]:
+    """Run against a simulated clock with a recording, measure live quality, and return the contents of
+    summary.json. `scale` multiplies the panels' rows and columns; `fixed` is the effort if `model.effort` is `full`, by
+    default all steps. The layers of every `keep_light`-th refresh, and the refreshes' records, go to `output`. Raises
+    FatalError.
+    """
+    options = RunOptions(max_speed=True, measure=True, scale=scale, fixed=fixed, keep_light=keep_light)
+    with ExitStack() as cleanup:
+        run = build_run(settings, options, cleanup, output=output)
+        run.observer.measure_only_live()
+        run.presenter.run()
+        run.observer.finish()
+        return run.summary()
+
+
 def settings_for(recording: Path, *, scene: str, effort: str) -> Settings:
     """Return settings for a simulated run of a recording, with the stage times of COSTS_MS."""
     table = Settings().model_dump()
@@ -46,21 +70,19 @@ def settings_for(recording: Path, *, scene: str, effort: str) -> Settings:
     return validated(Settings, table, source="settings")
 
 
-def moving_run(motion: str, effort: Effort | None, *, seconds: float = SECONDS, scale: float = 0.5) -> Moving:
+def moving_run(
+    motion: str, effort: Effort | None, *, seconds: float = SECONDS, scale: float = 0.5, seed: int = SEED
+) -> Moving:
     """Simulate a motion of SCENES by the viewer, or moving content in `film`, and measure what the viewer
     sees. Without an effort, the runtime chooses. `scale` multiplies rows and columns. Raises FatalError without a
     measurement.
     """
-    with ExitStack() as cleanup:
-        recording = Path(cleanup.enter_context(tempfile.TemporaryDirectory(prefix="phasestack-"))) / "motion.mcap"
+    with tempfile.TemporaryDirectory(prefix="phasestack-") as folder:
+        recording = Path(folder) / "motion.mcap"
         head = "still" if motion == "film" else motion
-        write_motion(recording, head, seconds=seconds, seed=SEED, noise_mm=NOISE_MM)
+        write_motion(recording, head, seconds=seconds, seed=seed, noise_mm=NOISE_MM)
         settings = settings_for(recording, scene=SCENES[motion], effort="full" if effort else "auto")
-        run = build_run(settings, RunOptions(max_speed=True, measure=True, scale=scale, fixed=effort), cleanup)
-        run.observer.measure_only_live()
-        run.presenter.run()
-        run.observer.finish()
-        summary = run.summary()
+        summary = simulated_run(settings, scale=scale, fixed=effort)
     view_error_mm, live_db = summary["view_error_mm"], summary["live_db"]
     name = effort.name if effort else "auto"
     if view_error_mm is None or live_db is None:

@@ -68,8 +68,7 @@ def both(name: str, stack: PanelStack, gl: GlBackend) -> tuple[StepPredictor, St
     """The model on the processor, and by OpenGL."""
     cpu, opengl = (load_predictor(name, stack, ModelSettings(threads=1)) for _ in range(2))
     assert isinstance(cpu, StepPredictor) and isinstance(opengl, StepPredictor)
-    opengl.set_backend(gl)
-    return cpu, opengl
+    return cpu, opengl.bound(backend=gl)
 
 
 def cards(pair: F64, stack: PanelStack, *, grey: bool = False) -> tuple[U8, U8]:
@@ -224,7 +223,7 @@ def test_a_panel_wider_than_the_driver_allows_is_refused(gl: GlBackend) -> None:
     with pytest.raises(
         InputError, match=rf"stack: width_px: is {widest + 8}, but this OpenGL driver allows at most {widest}"
     ):
-        choose("gl", predictor.on_panels(stack), lambda: gl.passes.context)
+        choose("gl", predictor.bound(stack=stack), lambda: gl.passes.context)
 
 
 def test_only_pictures_the_networks_answer_and_layers_cross(gl: GlBackend) -> None:
@@ -269,7 +268,7 @@ def test_automatic_is_the_processor_and_says_which_backend_failed(
     gl: GlBackend, monkeypatch: pytest.MonkeyPatch, failing: str
 ) -> None:
     predictor = load_predictor("fast", STACK)
-    solver = type(predictor.on_panels(STACK))
+    solver = type(predictor)
     real = solver.solve
 
     def solved(self: Any, job: Any) -> Any:
@@ -291,13 +290,13 @@ def test_a_model_that_has_one_backend_keeps_it() -> None:
 def test_a_lost_context_is_told_and_another_takes_over(gl: GlBackend) -> None:
     pair, lost = eyes(0.6), offscreen_context()
     predictor = load_predictor("fast", STACK)
-    predictor.set_backend(GlBackend(lost, STACK))
+    predictor = predictor.bound(backend=GlBackend(lost, STACK))
     before = layers_of(predictor, cards(pair, STACK), pair)
     lost.release()
     with pytest.raises(ContextLost):
         layers_of(predictor, cards(pair, STACK), pair)
     with gl.passes.context:
-        predictor.set_backend(gl)
+        predictor = predictor.bound(backend=gl)
         assert (layers_of(predictor, cards(pair, STACK), pair) == before).all()
 
 
