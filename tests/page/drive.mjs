@@ -176,6 +176,10 @@ for (const [width, target] of [[1280, page], [390, narrow]]) {
   await target.screenshot({ path: `${folder}/page-${width}.png`, fullPage: true });
   await target.screenshot({ path: `${folder}/page-${width}-top.png` });
   say(`fits ${width}`, await target.evaluate(() => document.documentElement.scrollWidth <= window.innerWidth));
+  say(`pause is in the first view at ${width}`, await target.evaluate(() => {
+    window.scrollTo(0, 0);
+    return document.querySelector("[data-command=pause]").getBoundingClientRect().bottom <= window.innerHeight;
+  }));
   say(`accessible at ${width}`, await findings(await evaluated(target)));
 }
 say("nothing from elsewhere", elsewhere);

@@ -35,6 +35,7 @@ CONTROLS = (
     "another model", "the model back", "a playlist", "the next one",
     "from a playlist to a scene", "a wish without a daemon is refused",
     "it goes on when it is back", "and without the old refusal", "fits 1280", "fits 390",
+    "pause is in the first view at 1280", "pause is in the first view at 390",
 )  # fmt: skip
 
 
