@@ -52,8 +52,8 @@ def contact_sheet(
     lines: Sequence[str] = (),
     focused: tuple[FocusTargets, tuple[U8, ...]] | None = None,
 ) -> U8:
-    """Draw a sheet (h, w, 3): a row of layers, each eye's target, retina image and error, and what the left
-    eye sees as it focuses (`Moment.focused`).
+    """Draw a sheet (h, w, 3): a row of layers, each eye's target, retina image and error, and what
+    the left eye sees as it focuses (`Moment.focused`).
     """
     height, width = layers.shape[1:3]
     tile = (TILE_WIDTH, round(TILE_WIDTH * height / width))

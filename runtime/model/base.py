@@ -72,8 +72,8 @@ class Predictor(ABC):
     def bound(
         self, *, backend: SolverBackend | None = None, stack: PanelStack | None = None, slots: LayerSlots | None = None
     ) -> Predictor:
-        """Return the model with another device, panels of another size, or memory shared with another process for its
-        layers. A network is shared. A model without a choice of devices returns itself.
+        """Return the model with another device, panels of another size, or memory shared with another
+        process for its layers. A network is shared. A model without a choice of devices returns itself.
         """
         return self
 
