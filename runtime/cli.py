@@ -17,6 +17,10 @@ if _signal.getsignal(_signal.SIGINT) is _signal.default_int_handler:  # leave an
     _signal.signal(_signal.SIGINT, _leave)
 
 
+# Matrices are small here. OpenBLAS keeps a buffer for each thread, and ends the process if there is no room for it.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
 def main() -> None:
     """Run the command that the arguments name, then exit the process. Never returns."""
     from runtime.commands.guard import run_guarded
