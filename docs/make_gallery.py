@@ -26,14 +26,18 @@ from PIL import Image, ImageDraw, ImageFont
 import phasestack
 from calib.board import boards as boards_of
 from runtime.config import StackGeometry, changed
+from runtime.content import shapes
+from runtime.content.scenes import Scene, Thing
 from runtime.daemon.build import scaled_stack
 from runtime.evaluation.motion_recording import write_motion
 from runtime.evaluation.refresh_quality import Pictures, view_error_mm
+from runtime.optics.carried import intensities
 from runtime.optics.pupil import PUPIL_MM
 from runtime.optics.retina import as_codes, average, pupil_points, seen_by
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import stack_from_eye
 from runtime.records import F64, U8
+from runtime.report import focal
 from runtime.report.moving import (
     FULL,
     NOISE_MM,
@@ -52,6 +56,7 @@ IMAGES = DOCS / "images"
 WIDTH_PX, LIMIT_BYTES = 1200, 200_000
 WRAPPED = 120  # characters per line of text
 FILM_BYTES, FILM_PX, FILM_EVERY = 1_500_000, (400, 225), 4  # size limit, picture size, refreshes per film frame
+PULLED, PULL_MS = 13, 250  # planes in the film of an eye that focuses, and the time for each
 FILM_S = 2.0, 8.0  # the film's start and end within the run
 PEOPLE_PX = 320, 180  # size of each eye's picture in the film of two people
 PICTURES = {  # name in docs/images: path in the work folder
@@ -60,7 +65,6 @@ PICTURES = {  # name in docs/images: path in the work folder
     "contact-sheet.jpg": "demo/contact-sheet.png",
     "frontier.png": "report/frontier-scenes.png",
     "moving-viewer.png": "report/moving-viewer.png",
-    "focal-slices.jpg": "report/focal-slices.png",
 }
 MOVING = f"""\
 The daemon's own loop ran for {SECONDS:g} s on the simulated clock, with 960x540 panels and {NOISE_MM} mm of sensor
@@ -98,6 +102,7 @@ lists pictures that should be seen from a point `mm` millimetres away from an ey
 """
 
 
+SHARPEST = ["card, mm", "sharpest through the layers, mm", "sharpest without the display, mm"]
 HEADINGS = ["method", "time, × fastest", "ms", "memory, MiB", "light 0 mm, dB", "**1 mm**", "2 mm", "one ray, dB"]
 
 
@@ -114,7 +119,11 @@ def page(report: dict[str, Any]) -> str:
         + [_number(method["psnr_db"])]
         for method in methods
     ]
-    cards = [[f"{1000 * card[key]:.0f}" for key in card] for card in report["focal"]["cards"]]
+    without, focus = report["focal"]["cards"], report["focal"]["focus"]["cards"]
+    cards = [
+        [f"{1000 * m:.0f}" for m in (*plain.values(), own["sharpest_shown_m"])]
+        for plain, own in zip(without, focus, strict=True)
+    ]
     return "\n".join(
         [
             HEAD,
@@ -135,8 +144,9 @@ def page(report: dict[str, Any]) -> str:
             "## Focal parallax\n",
             "Three cards are seen through a 4 mm pupil. For each card, the table gives its distance, and the "
             "distances of sharpest\nfocus for its picture through the layers and for the card itself.\n",
-            _table(["card, mm", "sharpest through the layers, mm", "sharpest without the display, mm"], cards),
-            "![focused behind, on and in front of the panels](images/focal-slices.jpg)",
+            _table([*SHARPEST, "sharpest [with focus](content.md#focus), mm"], cards),
+            "![an eye that focuses from the rear to the front, without and with focus, and of the scene itself]"
+            "(images/focus-pull.webp)",
             "",
         ]
     )
@@ -285,6 +295,34 @@ def two_people(folder: Path) -> None:
     save_film(frames, folder / "two-people.webp", period_ms=1000 * FILM_EVERY / settings.loop.rate_hz)
 
 
+def focus_pull(folder: Path) -> None:
+    """Write the film `focus-pull.webp`: what the right eye sees as it focuses from the rear to the front and back.
+
+    Each frame shows the view through layers solved without and with focus, and of the scene itself.
+    """
+    globe, box, card = shapes.sphere(0.017), shapes.box((0.024,) * 3), shapes.card(0.034, 0.036)
+    turned = shapes.rotation_about(2, np.radians(30))
+    things = (
+        Thing(globe, "globe", (-0.045, -0.043, 0.0)),
+        Thing(box, "crate", (0.0, 0.0, 0.0), rotation=turned),
+        Thing(card, "mosaic", (0.045, 0.040, 0.0), lit=False),
+    )
+    stack, eyes = StackGeometry().stack(), eyes_at(distance_m=focal.DISTANCE_M)
+    pixels, eye, frames = focal.seen_pixels(stack), eyes[1], []
+    size = {"width_px": pixels.raster.width_px, "height_px": pixels.raster.height_px}
+    with PairPainter(Scene("focus", things), stack) as painter:
+        both = [focal.cards_layers(painter, stack, eyes, model="best", focus=focus) for focus in (False, True)]
+        for plane_m in np.linspace(-0.06, 0.06, PULLED):
+            pictures = [pixels.seen(layers, stack, eye, plane_m=plane_m).image for layers in both]
+            pictures.append(pixels.true(lambda at, to: intensities(painter.draw(at, to, **size)), eye, plane_m=plane_m))
+            sheet = Image.fromarray(np.vstack([as_codes(picture) for picture in pictures]))
+            texts = (f"without focus, at {1000 * plane_m:+.0f} mm", "with focus", "the scene itself")
+            for row, text in enumerate(texts):
+                _label(sheet, (8, row * size["height_px"] + 6), text)
+            frames.append(sheet)
+    save_film([*frames, *frames[-2:0:-1]], folder / "focus-pull.webp", period_ms=PULL_MS)
+
+
 def light_of(eye_m: F64, layers: U8, stack: PanelStack, *, fov_deg: float) -> U8:
     """Compute the picture (h, w, 3) of the layers as seen by an eye, averaged over the pupil.
 
@@ -356,10 +394,11 @@ def main() -> None:
     look_into(arguments.work / "look")
     leaning(arguments.work / "look")
     two_people(arguments.work / "look")
+    focus_pull(arguments.work / "look")
     files = {name: smaller(arguments.work / source, name) for name, source in PICTURES.items()}
     files |= {
         name: (arguments.work / "look" / name).read_bytes()
-        for name in ("leaning.webp", "two-people.webp", "viewer.html")
+        for name in ("leaning.webp", "two-people.webp", "focus-pull.webp", "viewer.html")
     }
     text = page(json.loads((arguments.work / "report" / "report.json").read_text(encoding="utf-8")))
     for name, data in files.items():
