@@ -368,10 +368,10 @@ def test_panels_as_built_show_what_the_simulator_computes(tmp_path: Path) -> Non
     targets = [pair.left, pair.right]
     page = viewer_html(layers, targets, pair.stack, eyes_m=pair.eyes_m, fov_deg=pair.fov_deg, text=["as built"])
     (tmp_path / "viewer.html").write_text(page)
-    built = [{"shift_px": 3}, {"black": 0.02}, {}, {"short_deg": 5}]
+    built = [{"shift_px": 3}, {"black": 0.02}, {}, {"short_deg": 3, "dark_deg": 2}]
     told = driven("built.mjs", tmp_path / "viewer.html", 640, 360, json.dumps(built), tmp_path)
     assert told["errors"] == []
-    assert told["sliders"] == [0, 5, 0, 0, 0]
+    assert told["sliders"] == [0, 3, 2, 0, 0, 0]
     panels = Panels(pair.stack.width_m, pair.stack.height_m, pair.stack.x_m)
     rows, columns = np.arange(20, 340, 16), np.arange(20, 620, 16)
     shifted, grey, ideal = (cv2.imread(str(tmp_path / f"built-{k}.png"))[..., ::-1] / 255 for k in range(3))
@@ -379,7 +379,7 @@ def test_panels_as_built_show_what_the_simulator_computes(tmp_path: Path) -> Non
     truth, _ = light(front_moved, panels, pair.eyes_m[0], rows=rows, columns=columns)
     assert -10 * np.log10(((shifted[np.ix_(rows, columns)] - truth) ** 2).mean()) > 38
     assert np.abs(grey - (ideal + 0.02 * (1 - ideal))).mean() < 0.01
-    real = phasestack.RealPanels(cells=(phasestack.Cell(white_deg=85.0),))
+    real = phasestack.RealPanels(cells=(phasestack.Cell(white_deg=87.0, black_deg=2.0),))
     simulated_db = phasestack.evaluate(layers, *targets, **at, panels=real, sigmas_mm=(0,)).light_db["0"]
     assert float(re.findall(r"(\d+\.\d) dB", told["told"])[0]) == pytest.approx(simulated_db, abs=0.5)
 

@@ -7,9 +7,9 @@ const PUPILS = 7; // number of points traced in each pupil
 const BUILT_RAYS = 4; // least number of rays across a pixel for panels that are not ideal, whose pictures have no exact form
 
 // Imperfections of panels "as built" (runtime/optics/real): the front panel's shift to the right in pixels, how far full
-// white is short of 90 degrees, the grey curve's relative error in gamma, black divided by white, and the share of a
-// pixel that is black between its subpixels.
-export const IDEAL = { shift_px: 0, short_deg: 0, gamma: 0, black: 0, lines: 0 };
+// white is short of 90 degrees, how far black turns, the grey curve's relative error in gamma, black divided by white, and
+// the share of a pixel that is black between its subpixels.
+export const IDEAL = { shift_px: 0, short_deg: 0, dark_deg: 0, gamma: 0, black: 0, lines: 0 };
 
 export const mul = (a, b) => [0, 1, 2].flatMap((i) => [0, 1, 2].map((j) => a[3 * i] * b[j] + a[3 * i + 1] * b[3 + j] + a[3 * i + 2] * b[6 + j]));
 export const apply = (m, x, y) => {
@@ -221,7 +221,7 @@ const int PANELS = @PANELS@;
 uniform sampler2DArray layers; uniform sampler2D target;
 uniform mat3 into[PANELS]; uniform vec2 per_metre[PANELS]; uniform vec2 pupil[${PUPILS}]; uniform int pupils, rays, gain;
 uniform vec2 size, origin, stride, picture; uniform vec3 room;
-uniform float shift_px, turn, gamma, black, side; // "as built"; side: open share of a subpixel's width and of its height
+uniform float shift_px, dark, turn, gamma, black, side; // "as built"; side: open share of a subpixel's width and of its height
 out vec4 colour;
 vec2 off;
 vec2 place(int n, vec2 p) { vec3 h = into[n] * vec3(p, 1.0); return h.z > 0.0 ? h.xy / h.z + off * per_metre[n] : vec2(-1.0); }
@@ -257,7 +257,7 @@ vec4 ray(vec2 p) { // alpha 1: the ray crosses every panel
     if (n == PANELS - 1) q.x -= shift_px;
     if (any(lessThan(q, vec2(0.0))) || any(greaterThanEqual(q, size))) return vec4(0.0);
     vec3 code = texelFetch(layers, ivec3(q, n), 0).rgb;
-    sum += turn * (gamma == 1.0 ? code : pow(code, vec3(gamma)));
+    sum += dark + turn * (gamma == 1.0 ? code : pow(code, vec3(gamma)));
     if (side < 1.0) {
       vec2 middle = abs(fract(q * vec2(3.0, 1.0)) - 0.5);
       open *= all(lessThan(middle, vec2(0.5 * side))) ? 1.0 / (side * side) : 0.0;
@@ -496,8 +496,8 @@ export class Display {
       g.uniform1i(places.gain, this.targets[side] ? gain : 0);
       g.uniform2f(places.size, stack.width_px, stack.height_px);
       g.uniform2f(places.stride, ...stride);
-      const { shift_px, short_deg, gamma, black, lines } = this.built;
-      const values = { shift_px, turn: 1 - short_deg / 90, gamma: 1 + gamma, black, side: Math.sqrt(1 - lines) };
+      const { shift_px, short_deg, dark_deg, gamma, black, lines } = this.built;
+      const values = { shift_px, dark: dark_deg / 90, turn: 1 - (short_deg + dark_deg) / 90, gamma: 1 + gamma, black, side: Math.sqrt(1 - lines) };
       for (const [name, value] of Object.entries(values)) g.uniform1f(places[name] ?? null, value);
       g.uniform2f(places.picture, picture.width, picture.height);
       g.activeTexture(g.TEXTURE1);

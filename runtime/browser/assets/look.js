@@ -27,6 +27,7 @@ const REST_MS = 200, REST_RAYS = 5, STRIPS = 12, WIGGLE_MS = 280, REPORT_MS = 12
 const BUILT = [
   ["shift_px", "front panel off to the right, pixels", 3, 0.25, 1],
   ["short_deg", "full white short of 90°, degrees", 20, 1, 1],
+  ["dark_deg", "black that turns, degrees", 12, 0.5, 1],
   ["gamma", "grey curves off by a gamma, %", 30, 1, 0.01],
   ["black", "black as a share of white, %", 2, 0.1, 0.01],
   ["lines", "black lines between subpixels, % of the area", 60, 5, 0.01],
