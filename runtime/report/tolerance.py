@@ -48,6 +48,11 @@ class Imperfection:
     make: Make  # panels with this imperfection alone
     note: str = ""
     make_left: Make | None = None  # panels after the remedy, of the size `assumed`; None: those of the size `left`
+    choices: tuple[str, ...] = ()  # names of `sizes`, for a choice
+
+    def named(self, size: float) -> str:
+        """Return a size with its unit, or the name of a choice."""
+        return self.choices[self.sizes.index(size)] if self.choices else f"{size:.3g} {self.unit}"
 
     def after(self, stack: PanelStack) -> RealPanels:
         """Return the panels after the remedy."""
@@ -269,21 +274,22 @@ def _upside_down(share: float, stack: PanelStack) -> RealPanels:
 
 
 APERTURE = 0.6
+REAR_FILTERS_CD_M2 = 300.0 * APERTURE**2  # full white of a monitor of 300 cd/m² behind two panels without filters
 REGISTRATION = "registration (calibrate panels)"
 # The assumed sizes describe three 27-inch monitors that are mounted by hand (docs/planning.md says where from).
 IMPERFECTIONS = (
     Imperfection("shift of the front panel", "px", (0, 0.125, 0.25, 0.5, 1, 2), 1.6, 0.1, REGISTRATION, _shift),
     Imperfection(
         "rotation of the front panel", "mrad", (0, 0.25, 0.5, 1, 2, 4), 1.0, 0.05, REGISTRATION,
-        _front_off("roll_mrad"),
+        _front_off("rotation_mrad"),
     ),
     Imperfection(
         "size of the front panel", "%", (0, 0.02, 0.05, 0.1, 0.2, 0.5), 0.02, 0.005, REGISTRATION,
         _front_off("scale", 0.01, 1.0),
     ),
     Imperfection(
-        "slope of the front panel", "mrad", (0, 1, 2, 5, 10, 20), 3.0, 0.5, REGISTRATION,
-        _front_off("slope_right_mrad"),
+        "tilt of the front panel", "mrad", (0, 1, 2, 5, 10, 20), 3.0, 0.5, REGISTRATION,
+        _front_off("tilt_right_mrad"),
     ),
     Imperfection(
         "distance of the front panel", "mm", (0, 0.25, 0.5, 1, 2, 4), 1.0, 0.2, "measured x_m", _front_off("depth_mm")
@@ -324,16 +330,18 @@ IMPERFECTIONS = (
     Imperfection(
         "kind of cell", "", (0, 1, 2, 3, 4), 2.0, 1.0, "retarders between quarter-wave films (other panels)",
         lambda choice, stack: cell_choice(choice, stack.count),
-        "0: ideal rotators; 1: single-domain variable retarders between quarter-wave films; 2: twisted nematic at the "
-        "first minimum; 3: half-wave plates that turn (IPS); 4: the same with every other panel inverted",
+        "retarders of one domain; twisted nematic at the first minimum; half-wave plates that turn (IPS)",
+        choices=("rotators", "retarders", "twisted nematic", "half-wave plates", "these, alternately inverted"),
     ),
     Imperfection(
         "pixels", "", (0, 1, 2, 3), 3.0, 2.0, "colour filters on the rear panel alone (other panels)", _filters,
-        "0: no stripes; 1: open area of 60 %, no filters; 2: filters on the rear panel; 3: filters on all panels",
+        "an open area of 60 %, except without lines",
+        choices=("no black lines", "no filters", "filters on the rear", "filters on all"),
     ),
     Imperfection(
         "diffraction at the pixels", "", (0, 1), 1.0, 1.0, "",
         lambda choice, _: RealPanels(optics=Optics(diffracts=bool(choice), aperture=APERTURE)),
+        choices=("none", "at an open area of 60 %"),
     ),
     Imperfection(
         "haze of each panel", "%", (0, 1, 2, 5, 10, 25), 1.0, 1.0, "",
@@ -344,8 +352,9 @@ IMPERFECTIONS = (
         lambda percent, _: RealPanels(optics=Optics(reflectance=percent / 100)), "4.3 %: uncoated glass",
     ),
     Imperfection(
-        "light of the room", "lx", (0, 5, 10, 20, 50, 100), 10.0, 10.0, "",
-        lambda lux, _: RealPanels(lighting=Lighting(room_lux=lux)),
+        "light of the room", "lx", (0, 5, 10, 20, 50, 100), 10.0, 10.0, "colour filters on the rear panel alone",
+        lambda lux, _: RealPanels(lighting=Lighting(room_lux=lux)), "full white of 9 cd/m², then of 108 cd/m²",
+        lambda lux, _: RealPanels(lighting=Lighting(room_lux=lux, white_cd_m2=REAR_FILTERS_CD_M2)),
     ),
     Imperfection(
         "backlight darker in the corners", "%", (0, 5, 10, 20, 30, 50), 20.0, 20.0, "",

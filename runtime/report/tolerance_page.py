@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 from runtime.config import ModelSettings, load_settings
@@ -216,6 +217,11 @@ def cost_entry(cost: Cost, ideal_db: float) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def decibels(value: float) -> str:
+    """Format a cost, without a sign before 0.0."""
+    return f"{round(value, 1) + 0.0:.1f}"
+
+
 def cost_section(costs: Sequence[Cost], ideal_db: float, all_db: dict[str, float], *, is_first: bool) -> PageSection:
     """Return the table of imperfections, sorted by cost, with their curves."""
     ordered = sorted(costs, key=lambda cost: cost.assumed_db)
@@ -223,9 +229,9 @@ def cost_section(costs: Sequence[Cost], ideal_db: float, all_db: dict[str, float
     for cost in ordered:
         one = cost.imperfection
         at = cost.costs_1_db_at(ideal_db)
-        after = f"{ideal_db - cost.left_db:.1f}" if one.remedy else ""
+        after = decibels(ideal_db - cost.left_db) if one.remedy else ""
         rows.append([
-            one.name, f"{one.assumed:g} {one.unit}".strip(), f"{ideal_db - cost.assumed_db:.1f}",
+            one.name, one.named(one.assumed), decibels(ideal_db - cost.assumed_db),
             "" if at is None else f"{at:.2g} {one.unit}", one.remedy, after, one.note,
         ])  # fmt: skip
     headings = ["imperfection", "assumed", "costs, dB", "costs 1 dB at", "remedy", "then costs, dB", "note"]
@@ -236,7 +242,7 @@ def cost_section(costs: Sequence[Cost], ideal_db: float, all_db: dict[str, float
         f"{PIXELS_FIRST if is_first else PIXELS} pixels of each picture at the panels' full resolution.",
         f"All together as assumed: {all_db['assumed_db']:.1f} dB, with {100 * all_db['assumed_brightness']:.1f} % of "
         f"the brightness of ideal panels. With all remedies: {all_db['left_db']:.1f} dB, with "
-        f"{100 * all_db['left_brightness']:.1f} %. Costs do not add up.",
+        f"{100 * all_db['left_brightness']:.1f} %. Costs do not add up: diffraction and blur soften moiré.",
     ]
     figures = [] if is_first else [cost_figure(ordered, ideal_db)]
     return PageSection("Tolerances", text, figures, [Table(headings, rows)])
@@ -257,12 +263,13 @@ def cost_figure(costs: Sequence[Cost], ideal_db: float) -> Figure:
             else:
                 colours = ["C1" if size == one.assumed else "C0" for size in one.sizes]
                 axes.bar(one.sizes, cost.light_db, color=colours, width=0.6)
-                axes.set_xticks(one.sizes)
+                axes.set_xticks(one.sizes, [fill(name, 11) for name in one.choices])
             axes.axhline(ideal_db - 1, color="grey", linewidth=0.8, linestyle=":")
             axes.set_ylim(lowest - 1, ideal_db + 1.5)
             axes.set_title(one.name, fontsize=9)
-            axes.set_xlabel(one.unit or "choice", fontsize=8)
-            axes.tick_params(labelsize=8)
+            axes.set_xlabel(one.unit, fontsize=8)
+            axes.tick_params(labelsize=8 if one.unit else 5.5)
+            axes.tick_params(axis="y", labelsize=8)
         for axes in grid.flat[len(costs) :]:
             axes.set_axis_off()
         for row in grid:

@@ -381,6 +381,7 @@ def test_panels_as_built_show_what_the_simulator_computes(tmp_path: Path) -> Non
     assert np.abs(grey - (ideal + 0.02 * (1 - ideal))).mean() < 0.01
     real = phasestack.RealPanels(cells=(phasestack.Cell(white_deg=87.0, black_deg=2.0),))
     simulated_db = phasestack.evaluate(layers, *targets, **at, panels=real, sigmas_mm=(0,)).light_db["0"]
+    assert told["told"].endswith("dB against the target.")  # labels would mislead
     assert float(re.findall(r"(\d+\.\d) dB", told["told"])[0]) == pytest.approx(simulated_db, abs=0.5)
 
 

@@ -137,6 +137,18 @@ def test_residual_retardance_leaks_as_a_wave_plate_does() -> None:
     assert seen == pytest.approx([math.tan(math.pi * 30.0 / nm) ** 2 for nm in BANDS_NM], abs=1e-5)  # of white
 
 
+def test_retarders_with_parallel_axes_need_no_films() -> None:
+    """At 45 degrees to the polarizers they add up as rotators do; films between two panels cancel."""
+    angles = np.random.default_rng(4).uniform(0, math.pi / 2, (3, 100))
+    first, second, third = (retarder(2 * angle, math.pi / 4) for angle in angles)
+    seen = np.abs((third @ second @ first)[..., 1, 0]) ** 2
+    assert np.abs(seen - np.sin(angles.sum(axis=0)) ** 2).max() < 1e-12
+    for wavelength_nm in BANDS_NM:
+        cells = [retarder_between_quarter_waves(angle, DESIGN_NM / wavelength_nm) for angle in angles]
+        summed = retarder_between_quarter_waves(angles.sum(axis=0), DESIGN_NM / wavelength_nm)
+        assert np.abs(cells[2] @ cells[1] @ cells[0] - summed).max() < 1e-12
+
+
 def test_a_quarter_wave_plate_makes_circular_light() -> None:
     assert crossed_intensity(retarder(math.pi / 2, math.pi / 4)) == pytest.approx(0.5)
 
@@ -188,7 +200,7 @@ def test_a_shifted_panel_shows_other_pixels() -> None:
 
 def test_roll_scale_and_depth_move_pixels_as_geometry_says() -> None:
     through = np.array([[0.0, 0.03, 0.01]])
-    real = RealPanels(placement=(Placement(roll_mrad=10, scale=1.01), Placement(), Placement(depth_mm=1.0)))
+    real = RealPanels(placement=(Placement(rotation_mrad=10, scale=1.01), Placement(), Placement(depth_mm=1.0)))
     crossed = crossings(MIDDLE, through, STACK, real, random())
     rear = np.array([0.03, 0.01]) * 0.63 / 0.6
     turn = np.array([[math.cos(0.01), math.sin(0.01)], [-math.sin(0.01), math.cos(0.01)]])
@@ -200,7 +212,7 @@ def test_roll_scale_and_depth_move_pixels_as_geometry_says() -> None:
 
 def test_a_sloping_panel_is_met_where_its_plane_is() -> None:
     through = np.array([[0.0, 0.03, 0.01]])
-    real = RealPanels(placement=(Placement(), Placement(slope_right_mrad=50.0, slope_up_mrad=-20.0), Placement()))
+    real = RealPanels(placement=(Placement(), Placement(tilt_right_mrad=50.0, tilt_up_mrad=-20.0), Placement()))
     crossed = crossings(MIDDLE, through, STACK, real, random())
     y, z = (crossed.u[1, 0] / 160 - 0.5) * 0.12, (0.5 - crossed.v[1, 0] / 120) * 0.09
     x = 0.05 * y - 0.02 * z

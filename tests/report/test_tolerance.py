@@ -52,6 +52,8 @@ def test_all_imperfections_begin_with_ideal_panels() -> None:
         assert ideal.cells == (RealPanels().cells[0],) * 3, one.name
         assert ideal.placement == (Placement(),) * 3, one.name
         assert ideal.timing.is_still, one.name
+        assert bool(one.unit) != bool(one.choices), one.name
+        assert one.named(one.assumed), one.name
 
 
 def test_half_a_pixel_of_misalignment_costs_more_than_an_eighth(subject: Subject) -> None:
@@ -100,7 +102,7 @@ def test_the_size_that_costs_a_decibel_is_interpolated() -> None:
 def test_imperfections_together_keep_each_one() -> None:
     stack = PanelStack(0.5, 0.3, (-0.03, 0.0, 0.03), 64, 36)
     everything = together(IMPERFECTIONS, stack, left=False)
-    assert everything.placed(2).roll_mrad == 1.0
+    assert everything.placed(2).rotation_mrad == 1.0
     assert everything.placed(2).right_mm == pytest.approx(1.6 * 500 / 64)
     assert everything.cell(0).kind == "twisted-nematic"
     assert everything.cell(0).white_deg == 85.0

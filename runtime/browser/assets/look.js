@@ -351,9 +351,9 @@ export class Look {
   // Show the PSNR of the light at both eyes, followed by `note`.
   tell(light_db, note = "") {
     this.light_db = light_db;
-    const words = this.light_db > 33 ? "hard to distinguish from the target" : this.light_db > 27 ? "a good picture with faint traces of the other layers" :
+    const words = this.display.isBuilt ? "" : this.light_db > 33 ? "hard to distinguish from the target" : this.light_db > 27 ? "a good picture with faint traces of the other layers" :
       this.light_db > 21 ? "obvious ghosts and coloured edges" : "the layers fall apart";
-    this.$(".light").textContent = `Light at both eyes: ${this.light_db.toFixed(1)} dB against the target (${words})${note}.`;
+    this.$(".light").textContent = `Light at both eyes: ${this.light_db.toFixed(1)} dB against the target${words && ` (${words})`}${note}.`;
   }
 
   #modes() {

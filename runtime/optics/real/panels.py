@@ -18,10 +18,10 @@ class Placement:
     right_mm: float = 0.0  # shift to the viewer's right
     up_mm: float = 0.0
     depth_mm: float = 0.0  # towards the viewer
-    roll_mrad: float = 0.0  # rotation in the panel's plane, counter-clockwise as seen by the viewer
+    rotation_mrad: float = 0.0  # rotation in the panel's plane, counter-clockwise as seen by the viewer
     scale: float = 1.0  # true pixel pitch divided by the assumed one
-    slope_right_mrad: float = 0.0  # how far the panel comes towards the viewer, per metre to the right
-    slope_up_mrad: float = 0.0
+    tilt_right_mrad: float = 0.0  # how far the panel comes towards the viewer, per metre to the right
+    tilt_up_mrad: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -76,7 +76,7 @@ def _in_glass(right: F64, up: F64, distance_m: F64, glass_m: float, index: float
 
 def _cross(x: F64, y: F64, z: F64, right: F64, up: F64, plane_m: float, mounted: Placement) -> tuple[F64, F64, F64]:
     """Return where rays meet a panel's plane."""
-    to_right, to_up = mounted.slope_right_mrad / 1e3, mounted.slope_up_mrad / 1e3
+    to_right, to_up = mounted.tilt_right_mrad / 1e3, mounted.tilt_up_mrad / 1e3
     if to_right == 0.0 and to_up == 0.0:
         return np.full_like(x, plane_m), y + right * (plane_m - x), z + up * (plane_m - x)
     level = plane_m + to_right * (y - right * x) + to_up * (z - up * x)
@@ -88,7 +88,7 @@ def _pixels(y: F64, z: F64, stack: PanelStack, mounted: Placement) -> tuple[F64,
     """Return the pixel positions of points of a panel."""
     if mounted != Placement():
         y, z = y - mounted.right_mm / 1e3, z - mounted.up_mm / 1e3
-        c, s = math.cos(mounted.roll_mrad / 1e3), math.sin(mounted.roll_mrad / 1e3)
+        c, s = math.cos(mounted.rotation_mrad / 1e3), math.sin(mounted.rotation_mrad / 1e3)
         y, z = (c * y + s * z) / mounted.scale, (c * z - s * y) / mounted.scale
     return (y / stack.width_m + 0.5) * stack.width_px, (0.5 - z / stack.height_m) * stack.height_px
 
