@@ -36,6 +36,7 @@ from runtime.support.channel import shared_memory
 from runtime.support.process import Began, Ended, Role, Worker
 
 LATE_S = 0.5  # a longer step is late; a single step of more than twice this length is a fault
+ORDER_LATE_S = 10.0  # an order, such as to show another scene, that takes longer is a fault
 LATE_STEPS = 3  # this many late steps in a row are a fault; this many steps in a row on time clear it
 ANSWER_STEP_MS = 500  # the reported time without an answer is rounded down to a multiple of this
 REPLACED = "the solver was restarted with the old settings because it had ended or hung"
@@ -203,8 +204,10 @@ class SolverProcess(SolverHost):
         now_ns = self._clock.now_ns()
         if fault := self._worker.fault:
             return f"{fault} (for {_rounded_ms(now_ns - self._since_ns)} ms)"
-        busy_ns = now_ns - self._busy.since_ns if self._busy is not None else 0
-        if busy_ns > 2 * self._late_ns:
+        busy = self._busy
+        busy_ns = now_ns - busy.since_ns if busy is not None else 0
+        is_order = busy is not None and busy.effort is None
+        if busy_ns > (ORDER_LATE_S * NS_PER_S if is_order else 2 * self._late_ns):
             return f"the solver has not answered for {_rounded_ms(busy_ns)} ms"
         steps = tuple(self._took_ns)
         late = sum(took_ns > self._late_ns for took_ns in steps)

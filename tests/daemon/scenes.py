@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import time
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ def _lose_context() -> None:
     raise ContextLost("the driver reset the GPU")
 
 
-SCENE_DEEDS = DEEDS | {"grow": _grow, "lose": _lose_context}
+SCENE_DEEDS = DEEDS | {"grow": _grow, "lose": _lose_context, "nap": lambda: time.sleep(2.5)}
 
 
 class HarmfulOptions(Section):

@@ -158,6 +158,16 @@ def test_a_scene_that_hangs_or_crashes_while_it_loads_is_refused(rig: Rig, deed:
     assert rig.presenter.solver.facts.settings.content.options == {"file": str(deed)}
 
 
+def test_a_scene_that_takes_seconds_to_take_over_is_no_fault(rig: Rig, deed: Path) -> None:
+    settings, faults = rig.presenter.state.settings, dict(rig.presenter.stats.faults)
+    options = {"file": str(deed), "making": True}
+    deed.write_text("nap")
+    content = settings.content.model_copy(update={"options": options})
+    assert not problem_of(rig, ChangeSettings(settings.model_copy(update={"content": content})))
+    assert rig.presenter.stats.faults == faults
+    assert not problem_of(rig, ChangeSettings(settings))
+
+
 def test_orders_to_a_solver_that_has_ended_are_answered(rig: Rig) -> None:
     solver, answers = rig.presenter.solver, list[Answer]()
     restarts, pid = solver.restarts, solver_pid(rig.presenter)

@@ -341,7 +341,7 @@ function show(status) {
   setText($("state"), hangs ? "not responding" : late ? "late" : status.state ?? "starting");
   $("state").dataset.state = hangs ? "gone" : late ? "holding" : (status.state ?? "starting").split(":")[0];
   if (pictured && status.state !== pictured.state) lookAtPictures();
-  setText($("reason"), late ? `${reason}; use the model fast or panels with fewer pixels (the panels still follow the eyes)` : reason);
+  setText($("reason"), late ? `${reason}; use ${status.model === "fast" ? "" : "the model fast or "}panels with fewer pixels (the panels still follow the eyes)` : reason);
   if (status.state === undefined) return; // no refresh yet
   document.querySelector('[data-command="pause"]').setAttribute("aria-pressed", String(status.paused));
   document.querySelector('[data-command="flat"]').setAttribute("aria-pressed", String(status.flat_asked));
