@@ -62,6 +62,7 @@ PANEL = '[[output.panels]]\nconnector = "DP-{}"\n'
         ("[stack]\nx_m = [-0.06, false, 0.06]", "stack.x_m.1", "valid number"),
         ("[stack]\ntilt = [[0, 0], [0, true], [0, 0]]", "stack.tilt.1.1", "valid number"),
         ("[loop]\nsimulated_stage_ms = { render = true }", "loop.simulated_stage_ms.render", "valid number"),
+        ('[content]\nscale = "big"', "content.scale", "scale: Input should be a valid number"),
         ('[model]\neye_sigma_mm = "foo"', "model.eye_sigma_mm", "'auto' or a valid number"),
         ("loop = 60", "loop", "Input should be a table"),
         ("[output.panels]\nconnector = 'DP-1'", "output.panels", "Input should be a list in brackets"),

@@ -56,7 +56,8 @@ def _worded(name: str, value: Any) -> Any:
 
 def _summary(status: Mapping[str, Any]) -> Iterator[str]:
     state, reason = status.get("state", "starting"), status.get("reason")
-    wishes = [text for name, text in (("paused", "paused"), ("flat_asked", "flat was asked for")) if status.get(name)]
+    reason = (reason or "").removeprefix(f"{state.removeprefix('degraded: ')}: ")  # names the missing part again
+    wishes = ["paused"] if status.get("paused") else []
     yield _line("state", f"{state} ({reason})" if reason else state, *wishes)
     if "scene" in status:
         yield _line("shows", f"{status['scene']} with the model {status.get('model')}")

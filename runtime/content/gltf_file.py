@@ -39,6 +39,7 @@ COMPRESSED = {
     "KHR_meshopt_compression": "meshopt",
     "KHR_texture_basisu": "KTX2",
 }
+BEFORE_JSON = b"\xef\xbb\xbf\xff\xfe\0 \t\r\n"  # byte-order marks and spaces
 WAY_OUT = "save the model without that compression, with Blender or `gltf-transform`"
 
 
@@ -48,6 +49,8 @@ class GltfFile:
     """
 
     def __init__(self, path: Path, data: bytes, read: Read) -> None:
+        if data[:4] != b"glTF" and not data.lstrip(BEFORE_JSON).startswith((b"{", b"[")):
+            raise InputError(path, "", "is not a glTF file, or is damaged; export it again")
         text, self._binary = (data, b"") if data[:4] != b"glTF" else _chunks(path, data)
         self.path, self._read = path, read
         self.table: Table = untrusted_input.parsed_json(text, source=path, most_depth=LIMITS.depth)

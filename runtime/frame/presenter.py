@@ -300,7 +300,8 @@ class Presenter:
         )
         before = self.machine.name
         if self.machine.update(conditions, now_ns=self.clock.now_ns()):
-            line = f"state: {before} -> {self.machine.name} ({self.machine.reason})"
+            reason = self.machine.reason.removeprefix(f"{', '.join(self.machine.missing)}: ")
+            line = f"state: {before} -> {self.machine.name} ({reason})"
             log.info("%s", line, extra={"always": True})
         return self.machine.state
 

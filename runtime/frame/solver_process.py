@@ -203,7 +203,8 @@ class SolverProcess(SolverHost):
         """Return the reason why the solver is unavailable or late, or "" if it works on time."""
         now_ns = self._clock.now_ns()
         if fault := self._worker.fault:
-            return f"{fault} (for {_rounded_ms(now_ns - self._since_ns)} ms)"
+            gone_ms = _rounded_ms(now_ns - self._since_ns)
+            return f"{fault} (for {gone_ms} ms)" if gone_ms else fault
         busy = self._busy
         busy_ns = now_ns - busy.since_ns if busy is not None else 0
         is_order = busy is not None and busy.effort is None

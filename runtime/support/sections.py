@@ -25,6 +25,7 @@ PLAIN = {  # pydantic's messages that name types of Python, in the words of a co
     "bool_parsing": EXPECTED + "true or false",
     "bool_type": EXPECTED + "true or false",
     "dict_type": EXPECTED + "a table",
+    "float_parsing": EXPECTED + "a valid number",
     "int_parsing": EXPECTED + "a whole number",
     "list_type": EXPECTED + "a list in brackets",
     "model_type": EXPECTED + "a table",

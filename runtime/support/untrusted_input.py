@@ -173,6 +173,10 @@ def parsed_json(text: str | bytes, *, source: str | Path, most_depth: int = JSON
         )
         if _depth(value) <= most_depth:
             return value
+    except json.JSONDecodeError as error:
+        raise InputError(
+            source, "", f"malformed JSON at line {error.lineno}, column {error.colno}: {error.msg}"
+        ) from None
     except ValueError as error:
         raise InputError(source, "", f"malformed JSON: {error}") from None
     except RecursionError:

@@ -260,6 +260,12 @@ def test_a_glb_without_a_binary_chunk_is_said_to_be_incomplete(tmp_path: Path) -
         load_mesh(tmp_path / "a.glb")
 
 
+@pytest.mark.parametrize("data", [b"", b"junk\n", bytes(64)])
+def test_a_file_of_another_kind_is_named_in_plain_words(tmp_path: Path, data: bytes) -> None:
+    (tmp_path / "a.glb").write_bytes(data)
+    assert refusal(load_mesh, tmp_path / "a.glb").endswith("a.glb: is not a glTF file, or is damaged; export it again")
+
+
 @pytest.mark.parametrize("uri", ["Textures/WOOD é.png", "textures\\wood e\u0301.png", "textures/wood%20%C3%A9.png"])
 def test_a_texture_is_found_in_another_case_or_unicode_form(tmp_path: Path, uri: str) -> None:
     b = Buffer()

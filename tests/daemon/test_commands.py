@@ -69,7 +69,7 @@ def test_people_see_state_reason_rate_eyes_and_faults_and_machines_one_object(se
 def test_the_status_begins_with_the_five_lines_that_matter(server: StatusServer) -> None:
     lines = ask_status(server.path).stdout.splitlines()
     assert [" ".join(line.split()) for line in lines[:6]] == [
-        "state degraded: sensor (sensor: unplugged)", "shows room with the model fast",
+        "state degraded: sensor (unplugged)", "shows room with the model fast",
         "rate 31.5 refreshes/s, 0 solutions/s", "quality 33.5 dB (light_db, at the eyes now)",
         "faults sensor: unplugged; 4 x sensor since startup", "",
     ]  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -103,7 +104,10 @@ def test_a_scene_that_calls_exit_ends_no_solver(rig: Rig, deed: Path) -> None:
 
 
 @pytest.mark.parametrize("how", [signal.SIGSEGV, signal.SIGKILL, signal.SIGSTOP])
-def test_a_solver_that_is_ended_from_outside_is_replaced_without_leaks(rig: Rig, how: int) -> None:
+def test_a_solver_that_is_ended_from_outside_is_replaced_without_leaks(
+    rig: Rig, how: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", "phasestack")
     me = psutil.Process()
 
     def replace_it() -> tuple[int, int, int]:
@@ -113,6 +117,7 @@ def test_a_solver_that_is_ended_from_outside_is_replaced_without_leaks(rig: Rig,
         return me.num_fds(), me.num_threads(), len(me.children())
 
     assert replace_it() == replace_it()
+    assert "degraded: model (" in caplog.text and not re.search(r"\(model: |for 0 ms", caplog.text)
 
 
 def problem_of(rig: Rig, order: Any) -> str:
