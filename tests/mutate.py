@@ -24,7 +24,12 @@ from typing import Any
 
 ROOT = Path(__file__).parents[1]
 COPIED = ("runtime", "calib", "model_export", "phasestack", "tests", "examples", "docs", "systemd", "pyproject.toml")
-TESTS_OF = {"kernels": ("model", "panels", "optics"), "plan": ("plan", "frame"), "browser": ("daemon",)}
+TESTS_OF = {
+    "kernels": ("model", "panels", "optics"),
+    "plan": ("plan", "frame"),
+    "browser": ("daemon", "browser"),
+    "page": ("page", "browser"),
+}
 LONGEST = 5.0  # tests that take this many times longer than without a change have noticed it
 SWAPPED: dict[type[ast.AST], type[ast.AST]] = {
     ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
