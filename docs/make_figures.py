@@ -1,4 +1,4 @@
-"""Draw optics.png, architecture.png and clocks.png in docs/images, and the example pair.
+"""Draw optics.png, architecture.png, clocks.png and as-built.jpg in docs/images, and the example pair.
 
 Run `python -m docs.make_figures`.
 """
@@ -12,19 +12,30 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
+from PIL import Image, ImageDraw, ImageFont
 
 from phasestack.example import EYES_M, SCENE
 from phasestack.example import FOV_DEG as EXAMPLE_FOV_DEG
 from runtime.config import ModelSettings, StackGeometry
 from runtime.model.predictor import load_predictor
 from runtime.model.still import solve_still
-from runtime.optics.retina import seen_by
+from runtime.optics.pupil import PUPIL_MM
+from runtime.optics.real.cells import Cell
+from runtime.optics.real.panels import Optics, Placement, RealPanels
+from runtime.optics.real.trace import Tables, crossings
+from runtime.optics.retina import as_codes, seen_by
+from runtime.optics.views import image_from_camera, stack_from_eye
+from runtime.records import F64
 from runtime.report.pairs import PairPainter, eyes_at
+from runtime.report.tolerance import IMPERFECTIONS, Subject, solved, together
+from runtime.report.tolerance_page import scene_pair
 from runtime.support.artifacts import write_png
 
 IMAGES = Path(__file__).resolve().parent / "images"
 LEFT, RIGHT, INK, SOFT = "#1f6fb4", "#d1661b", "#222222", "#8a8f98"
 FOV_DEG = 40.0
+CROP_PX, CORNER_PX = (240, 160), (780, 440)  # crop of the left eye's picture, width and height, and its corner
+RAYS, RAYS_FILTERED = 96, 2048  # rays per pixel, without and with black lines, which few rays pass
 
 
 def arrow(axes: Any, start: tuple[float, float], end: tuple[float, float]) -> None:
@@ -162,6 +173,50 @@ def clocks() -> Figure:
     return figure
 
 
+def through_panels(subject: Subject, real: RealPanels) -> F64:
+    """Return a crop of what the left eye sees through panels, relative to full white, from 0 to 1."""
+    pair, random = subject.pair, np.random.default_rng(2)
+    stack, eye_m, pose = pair.stack, pair.eyes_m[0], stack_from_eye(pair.eyes_m[0])
+    height, width = pair.images[0].shape[:2]
+    focal_px = image_from_camera(width_px=width, height_px=height, fov_deg=pair.fov_deg)[0, 0]
+    rows, columns = CROP_PX[1], CROP_PX[0]
+    v, u = np.mgrid[0:rows, 0:columns].reshape(2, -1) + np.array([CORNER_PX[1], CORNER_PX[0]])[:, None]
+    tables, light, white = Tables(subject.layers, stack, real), np.zeros((len(u), 3)), np.zeros((len(u), 3))
+    for _ in range(RAYS_FILTERED if real.optics.filters else RAYS):
+        place = random.random((2, len(u)))
+        radius = PUPIL_MM / 2e3 * np.sqrt(random.random(len(u)))
+        angle = 2 * np.pi * random.random(len(u))
+        start_m = eye_m + np.outer(radius * np.cos(angle), pose[:3, 0]) + np.outer(radius * np.sin(angle), pose[:3, 1])
+        gaze = np.stack([u + place[0] - width / 2, height / 2 - v - place[1]], -1) / focal_px
+        gaze = gaze @ pose[:3, :2].T - pose[:3, 2]
+        middle_m = eye_m + gaze * ((stack.x_m[stack.count // 2] - eye_m[0]) / gaze[:, :1])
+        both = tables.light(crossings(start_m, middle_m, stack, real, random), float(eye_m[0]))
+        light, white = light + both[0], white + both[1]
+    veil = real.lighting.veil
+    seen = (light / white.mean(axis=0) + veil) / (1 + veil)
+    return np.asarray(seen.reshape(rows, columns, 3).clip(0, 1), np.float64)
+
+
+def as_built() -> Image.Image:
+    """Draw what the left eye sees of the 27-inch build on ideal panels and on imperfect ones."""
+    stack = replace(StackGeometry().stack(), width_m=0.598, height_m=0.336)
+    subject = solved(scene_pair(stack))
+    off = Placement(right_mm=1.6 * stack.width_m / stack.width_px * 1e3)
+    kinds = {
+        "ideal panels": RealPanels(),
+        "front panel 1.6 px off": RealPanels(placement=(Placement(), Placement(), off)),
+        "full white of 85°": RealPanels(cells=(Cell(white_deg=85.0),)),
+        "black lines, no filters": RealPanels(optics=Optics(filters=(False,) * stack.count, aperture=0.6)),
+        "all, with remedies": together(IMPERFECTIONS, stack, left=True),
+    }
+    sheet = Image.new("RGB", (len(kinds) * CROP_PX[0], CROP_PX[1]))
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(15)
+    for n, (name, real) in enumerate(kinds.items()):
+        sheet.paste(Image.fromarray(as_codes(through_panels(subject, real))), (n * CROP_PX[0], 0))
+        draw.text((n * CROP_PX[0] + 8, 6), name, fill="white", font=font, stroke_width=3, stroke_fill="black")
+    return sheet
+
+
 def draw_example() -> None:
     """Render the pictures used by `phasestack.example_pair`."""
     stack = replace(StackGeometry().stack(), width_px=640, height_px=360)
@@ -176,6 +231,7 @@ def main() -> None:
     draw_example()
     for draw in (optics, architecture, clocks):
         draw().savefig(IMAGES / f"{draw.__name__}.png", dpi=110, metadata={"Software": None})
+    as_built().save(IMAGES / "as-built.jpg", quality=88, optimize=True)
 
 
 if __name__ == "__main__":
