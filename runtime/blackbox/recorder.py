@@ -143,9 +143,11 @@ class Recorder(logging.Handler):
         self._state, self._state_ns = ("", ""), 0
         self._fault: tuple[int, str] | None = None  # start and kind of a fault not yet written to a file
         self._faults_ns: dict[str, int] = {}  # time of the latest fault of each kind
+        self._recorded: dict[str, dict[str, Any]] = {}  # entry in `_faulty` of the latest fault of each kind
         self._last_file: Path | None = None
         self._lines: deque[dict[str, Any]] = deque(maxlen=LINES_KEPT)
         self._passed: deque[dict[str, Any]] = deque(maxlen=STATES_KEPT)
+        self._faulty: deque[dict[str, Any]] = deque(maxlen=STATES_KEPT)  # the faults among them, with their files
         self._waiting_lock, self._is_writing = threading.Lock(), False
         self._waiting: dict[str, list[Saved]] = {}  # requests for files not yet started by the writer, by kind
         self._writer: BackgroundJob[None] | None = None
@@ -202,12 +204,15 @@ class Recorder(logging.Handler):
 
     def _state_changed(self, name: str, reason: str, at_ns: int) -> None:
         self._passed.append({"time_s": round(time.time(), 3), "state": name, "reason": reason})
+        if name.startswith("degraded"):
+            self._faulty.append(self._passed[-1] | {"file": None})
         was_well = self._state[0].partition(":")[0] not in ("", "starting", "degraded")  # a slow startup is not a fault
         if not name.startswith("degraded") or not was_well or self._fault is not None or not self._most_ns:
             return
         kind = "fault-" + name.partition(": ")[2].replace(", ", "+")
         if at_ns - self._faults_ns.get(kind, -FAULTS_APART_NS) >= FAULTS_APART_NS:
             self._fault, self._faults_ns[kind] = (at_ns, kind), at_ns
+            self._recorded[kind] = self._faulty[-1]
 
     def emit(self, record: logging.LogRecord) -> None:
         """Keep a log record. Called on any thread."""
@@ -259,6 +264,7 @@ class Recorder(logging.Handler):
             try:
                 self._last_file = write_file(self._folder, kind, kept, *_head(presenter))
                 log.info("black box written: %s", self._last_file, extra={"always": True})
+                self._recorded.get(kind, {})["file"] = str(self._last_file)
                 make_room(self._folder)
             except OSError as error:
                 log.error("the black box could not be written: %s", error)
@@ -267,8 +273,8 @@ class Recorder(logging.Handler):
                 saved(problem, None if problem else self._last_file)
 
     def look_at_log(self) -> dict[str, Any]:
-        """Return the latest log lines and states, oldest first, with times in seconds since 1970."""
-        return {"lines": list(self._lines), "states": list(self._passed)}
+        """Return the latest log lines, states and faults, oldest first, with times in seconds since 1970."""
+        return {"lines": list(self._lines), "states": list(self._passed), "faults": list(self._faulty)}
 
     def describe(self) -> dict[str, Any]:
         """Return the black box's entry in the daemon's status."""

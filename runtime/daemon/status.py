@@ -168,6 +168,7 @@ def pictures(status: Status | None, stack: PanelStack) -> dict[str, Any]:
         "frame": status.refresh.account.frame,
         "time_s": time.time(),
         "state": status.name,
+        "eyes_m": _shown_to(status.refresh)[1],
         "jpegs": {name: b64encode(jpeg).decode() for name, jpeg in jpegs.items()},
     }
 
@@ -181,9 +182,7 @@ def pictures_of(refresh: Refresh, stack: PanelStack, *, fov_deg: float) -> dict[
     rear panel), `layer-1` and so on. Each eye's view, `seen-left` and `seen-right`, is computed from reduced layers at
     the eye position that was solved for, because an exact view would take longer than a refresh.
     """
-    frame, account = refresh.frame, refresh.account
-    is_flat = frame.solved is None or (frame.flat is not None and frame.flatness > 0.5)
-    shown, eyes_m = (frame.flat, account.eyes_m) if is_flat else (frame.solved, account.solved_for_m)
+    shown, eyes_m = _shown_to(refresh)
     if shown is None:
         return {}
     width = min(WIDTH_PX, stack.width_px)
@@ -201,6 +200,13 @@ def pictures_of(refresh: Refresh, stack: PanelStack, *, fov_deg: float) -> dict[
             seen = seen_by(eye_m, layers, small, fov_deg=fov_deg)
             jpegs[name] = _jpeg(np.rint(255 * seen.image * seen.mask[..., None]).astype(np.uint8))
     return jpegs
+
+
+def _shown_to(refresh: Refresh) -> tuple[U8 | None, Any]:
+    """Return the layers that are shown, and the eye positions that they are for."""
+    frame, account = refresh.frame, refresh.account
+    is_flat = frame.solved is None or (frame.flat is not None and frame.flatness > 0.5)
+    return (frame.flat, account.eyes_m) if is_flat else (frame.solved, account.solved_for_m)
 
 
 def _jpeg(image: U8) -> bytes:

@@ -170,6 +170,7 @@ def test_a_fault_writes_what_preceded_and_followed_it_for_its_owner_alone(tmp_pa
         rig.refresh_until(lambda: bool(list(tmp_path.glob("blackbox-*.mcap"))))
         recorder.close()
     path = the_file(tmp_path)
+    assert [fault["file"] for fault in recorder.look_at_log()["faults"]] == [str(path)]
     assert path.stem.endswith("-fault-sensor") and stat.S_IMODE(path.stat().st_mode) == 0o600
     messages = read(path)
     states = [m.value["state"] for m in messages if m.topic == "/state"]

@@ -61,6 +61,7 @@ await page.keyboard.press("Enter");
 await page.waitForSelector("#login", { state: "hidden" });
 say("state is shown", await until(async () => ["tracking", "holding", "flat", "degraded"].some((s) => s === null) ||
   /tracking|holding|flat|degraded/.test(await page.textContent("#state"))));
+say("health is told", await shows("#reason", "All is well"));
 say("pictures are shown", await until(() => page.evaluate(() =>
   [...document.querySelectorAll("#pictures img[src]")].filter((i) => i.naturalWidth > 100).length >= 3)));
 
@@ -88,6 +89,7 @@ say("figures changed", [seen.size, frames.size, curves.size, eyes.size]);
 
 // Every control.
 await page.click("[data-command=pause]");
+say("a pause is told", (await shows("#reason", "Paused by you")) && (await page.getAttribute("#state", "data-state")) === "paused");
 say("pause", (await told("pause: done")) && (await statusIs((s) => s.paused)) &&
   (await until(async () => (await page.getAttribute("[data-command=pause]", "aria-pressed")) === "true")));
 await page.click("[data-command=resume]");
@@ -108,28 +110,43 @@ await choose("scene", "grey");
 say("scene", (await told("scene: done")) && (await statusIs((s) => s.scene === "grey")));
 await choose("scene", "no-such-scene");
 say("a scene that is not there", (await told("no-such-scene")) && (await statusIs((s) => s.scene === "grey")));
+await page.waitForTimeout(1500);
+say("a refused name stays", (await page.inputValue("#scene-file")) === "no-such-scene");
+await page.click("#place-reset");
+say("old errors vanish", await until(async () => (await page.$$('[data-kind="bad"]')).length === 0 && (await page.textContent("#scene-told")) === ""));
 await choose("scene", "demo");
 say("scene back", (await told("scene: done")) && (await statusIs((s) => s.scene === "demo")));
 // The place, the model, a playlist.
 await page.fill("#p-right", "60");
+await page.waitForTimeout(1500);
+say("not moved while typing", (await now()).placing.offset_m[1] === 0);
+await page.keyboard.press("Enter");
 say("moved at once", (await statusIs((s) => Math.abs(s.placing.offset_m[1] - 0.06) < 1e-9)) &&
   (await until(async () => (await page.textContent("#placed")).includes("place: done"))));
 await page.fill("#p-turntable", "6");
+await page.keyboard.press("Tab");
 say("turntable", await statusIs((s) => s.placing.turntable_per_min === 6 && Math.abs(s.placing.offset_m[1] - 0.06) < 1e-9));
 const scales = [];
 for (const scale of ["2", "0.5", "1.5", "1.2345"]) {
   await page.fill("#p-scale", scale);
+  await page.keyboard.press("Enter");
   scales.push(await statusIs((s) => s.placing.scale === Number(scale)));
 }
 say("any scale", scales.every(Boolean));
 await page.fill("#p-scale", "1001");
+await page.keyboard.press("Enter");
 say("a scale out of range", await shows("#placed", "Scale: must be a number from 0.001 to 1000") && (await now()).placing.scale === 1.2345);
 await page.click("#place-reset");
 say("as configured", await statusIs((s) => s.placing.turntable_per_min === 0 && s.placing.offset_m[1] === 0));
+await page.evaluate(() => {
+  window.texts = [];
+  new MutationObserver(() => window.texts.push(document.getElementById("model-told").textContent)).observe(document.getElementById("model-told"), { childList: true });
+});
 await choose("model", "sart");
 say("another model", (await told("model: done")) && (await statusIs((s) => s.model.startsWith("sart"))));
 await choose("model", "fast");
 say("the model back", (await told("model: done")) && (await statusIs((s) => s.model.startsWith("fast"))));
+say("loading is told", (await page.evaluate(() => window.texts)).some((text) => /^(loading|testing).* … \d+ s$/.test(text)));
 await choose("scene", playlist);
 say("a playlist", (await told("scene: done")) && (await statusIs((s) => s.playlist && s.playlist.entries.length === 2 && s.content.includes("flat (1 of 2)"))) &&
   (await until(async () => (await page.textContent("#list-told")).includes("1 of 2"))));
@@ -150,6 +167,15 @@ for (let k = 0; k < 70; k += 1) {
 }
 say("reached by tab", reached);
 
+// The solver dies.
+process.kill((await now()).processes.find((one) => one.role === "solver").pid, "SIGKILL");
+say("a fault is told", await shows("#reason", "Fault since "));
+say("faults have their black box", await until(async () => /was ended by SIGKILL.*; black box: \/.*-fault-model\.mcap/.test(await page.textContent("#faulty"))));
+await page.setViewportSize({ width: 1440, height: 900 });
+await page.screenshot({ path: `${folder}/page-1440.png` });
+await page.screenshot({ path: `${folder}/page-1440-full.png`, fullPage: true });
+await page.setViewportSize({ width: 1280, height: 900 });
+
 // The daemon hangs, dies and comes back.
 await parent("freeze");
 say("it says that the daemon hangs", (await until(() => page.isVisible("#gone"))) && (await shows("#state", "not responding")));
@@ -157,19 +183,23 @@ await parent("thaw");
 say("it goes on when it hangs no more", await until(() => page.isHidden("#gone")));
 await parent("kill");
 say("it says that the daemon is gone", (await until(() => page.isVisible("#gone"))) && (await shows("#state", "no daemon")));
-await page.click("[data-command=pause]");
-say("a wish without a daemon is refused", await until(async () => (await page.getAttribute("#told", "data-kind")) === "bad"));
+say("it says how to start one", (await page.textContent("#gone")).includes("sudo systemctl start phasestack"));
+say("without a daemon, controls are disabled", await page.$$eval("main :is(button, input, select)", (all) =>
+  all.every((control) => control.disabled && control.getAttribute("aria-pressed") !== "true")));
 await page.screenshot({ path: `${folder}/page-gone.png` });
 await parent("start");
 say("it goes on when it is back", (await until(() => page.isHidden("#gone"))) && (await shows("#numbers", "presented")));
-say("and without the old refusal", await until(async () => (await page.textContent("#told")) === ""));
+say("and its controls work", await page.isEnabled("[data-command=pause]"));
 await statusIs((s) => s.eyes_m && s.presented > 100);
 await page.waitForTimeout(8000);
 
 // As it looks, wide and narrow; accessibility.
 const narrow = await context.newPage();
 await narrow.setViewportSize({ width: 390, height: 844 });
-await narrow.goto(origin);
+await narrow.goto(origin, { waitUntil: "commit" });
+await narrow.waitForSelector("#scene option", { state: "attached" });
+say("the list says that it is loading", (await narrow.textContent("#scene")).includes("loading the list"));
+say("the list is soon there", await narrow.waitForSelector("#scene option[value=grey]", { state: "attached", timeout: 3000 }).then(() => true, () => false));
 await narrow.waitForSelector("#pictures img[src]");
 await narrow.waitForTimeout(5000);
 for (const [width, target] of [[1280, page], [390, narrow]]) {

@@ -33,8 +33,11 @@ CONTROLS = (
     "it says that the daemon hangs", "it goes on when it hangs no more",
     "moved at once", "turntable", "any scale", "a scale out of range", "as configured",
     "another model", "the model back", "a playlist", "the next one",
-    "from a playlist to a scene", "a wish without a daemon is refused",
-    "it goes on when it is back", "and without the old refusal", "fits 1280", "fits 390",
+    "from a playlist to a scene", "without a daemon, controls are disabled",
+    "it says how to start one", "health is told", "a pause is told", "a refused name stays", "old errors vanish",
+    "not moved while typing", "loading is told", "a fault is told", "faults have their black box",
+    "the list says that it is loading", "the list is soon there",
+    "it goes on when it is back", "and its controls work", "fits 1280", "fits 390",
     "pause is in the first view at 1280", "pause is in the first view at 390",
 )  # fmt: skip
 

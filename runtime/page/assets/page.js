@@ -49,12 +49,12 @@ const clock = (seconds) => new Date(seconds * 1000).toLocaleTimeString([], { hou
 const PLOTS = [
   ["refreshes/s", (s) => s.fps_now, 1],
   ["solutions/s", (s) => s.solutions_per_s_now, 1],
-  ["solution age, ms", (s) => age(s.solution_age_now_ms), 1],
-  ["view error (estimated), mm", (s) => s.view_error_estimated_now_mm, 1],
+  ["solution age, ms", (s) => age(s.solution_age_now_ms), 1, "Time since the picture was computed."],
+  ["view error (estimated), mm", (s) => s.view_error_estimated_now_mm, 1, "How far the eyes are from where the picture is correct."],
   ["capture to light, ms", (s) => s.photon_now_ms, 1],
   ["uncertainty of the eyes, mm", (s) => s.eye_sigma_now_mm, 2],
   ["presenting (median), ms", (s) => s.stage_ms?.present?.p50, 2],
-].map(([title, value, digits]) => {
+].map(([title, value, digits, meaning]) => {
   const box = html("div");
   box.className = "plot";
   const line = html("p");
@@ -67,6 +67,7 @@ const PLOTS = [
   axis.className = "axis";
   axis.append(svg, most, least);
   box.append(line, axis);
+  if (meaning) box.append(Object.assign(html("p", meaning), { className: "key" }));
   $("plots").append(box);
   return { value, digits, shown, curve, most, least, values: [] };
 });
@@ -171,7 +172,7 @@ function leftOut(status) {
 
 function entries(list, items, made) {
   const newest = [...items].reverse();
-  const key = JSON.stringify(newest[0] ?? null) + newest.length;
+  const key = JSON.stringify(newest);
   if (list.dataset.key === key) return;
   list.dataset.key = key;
   list.replaceChildren(...newest.map((item) => {
@@ -184,21 +185,29 @@ function entries(list, items, made) {
 
 // Pictures.
 
-const NAMED = (name) => name.startsWith("layer-") ? `panel ${name.slice(6)}${name === "layer-0" ? " (rear)" : ""}` :
+const PLACES = (number, count) => number === 0 ? " (rear)" : number === count - 1 ? " (front)" : count === 3 ? " (middle)" : "";
+const NAMED = (name, count) => name.startsWith("layer-") ? `panel ${name.slice(6)}${PLACES(Number(name.slice(6)), count)}` :
   name === "seen-left" ? "seen by the left eye" : "seen by the right eye";
+
+// Where an eye is, as seen by the viewer.
+function placeOf([out, right, up]) {
+  const cm = (value) => `${Math.abs(100 * value).toFixed(0)} cm`;
+  return `${cm(out)} in front, ${cm(right)} ${right < 0 ? "left" : "right"}, ${cm(up)} ${up < 0 ? "down" : "up"}`;
+}
 
 function pictures(answer) {
   const box = $("pictures");
   const names = Object.keys(answer.jpegs ?? {}).sort();
+  const count = names.filter((name) => name.startsWith("layer-")).length;
   const eyes = ["seen-left", "seen-right"].filter((name) => !names.includes(name));
   for (const name of [...names, ...eyes]) {
     let figure = box.querySelector(`[data-name="${name}"]`);
     if (!figure) {
       figure = html("figure", "", { name });
       const image = document.createElement("img");
-      image.alt = NAMED(name);
+      image.alt = NAMED(name, count);
       image.hidden = true;
-      figure.append(image, html("figcaption", NAMED(name)));
+      figure.append(image, html("figcaption"));
       box.append(figure);
       [...box.children].sort((a, b) => a.dataset.name.localeCompare(b.dataset.name)).forEach((f) => box.append(f));
     }
@@ -206,7 +215,9 @@ function pictures(answer) {
     const data = answer.jpegs?.[name];
     image.hidden = false;
     if (data) image.src = `data:image/jpeg;base64,${data}`;
-    setText(caption, NAMED(name) + (data ? "" : ": no viewer"));
+    const eye_m = answer.eyes_m?.[name === "seen-left" ? 0 : 1];
+    const seen = name.startsWith("seen-") && eye_m ? `, from ${placeOf(eye_m)}` : "";
+    setText(caption, NAMED(name, count) + (data ? seen : ": no viewer"));
   }
   box.dataset.frame = answer.frame ?? "";
   pictured = { time_s: answer.time_s, state: answer.state, arrived_ms: performance.now() };
@@ -270,7 +281,7 @@ async function sendPlacing() {
 }
 
 for (const [id, name, part, units] of PLACE) {
-  $(id).addEventListener("input", () => {
+  $(id).addEventListener("change", () => {
     if (!placed || $(id).validity.valueMissing || ($(id).value === "" && $(id).validity.valid)) return;
     if (!$(id).checkValidity()) {
       const { min, max, labels: [{ textContent: label }] } = $(id);
@@ -314,11 +325,57 @@ async function lookUp(name) {
   return lookUp(name);
 }
 
+// Health.
+
+let faultSince_s = null, pending = null, loadingSince_ms = null, refusedBefore = false;
+
+function health(status) {
+  const reason = status.reason ?? "", [state, part] = (status.state ?? "starting").split(": ");
+  const fault = state === "degraded";
+  faultSince_s = fault ? faultSince_s ?? Date.now() / 1000 : null;
+  if (fault) return `Fault since ${clock(faultSince_s).slice(0, 5)}: ${reason.replace(`${part}: `, "")}; it repairs itself`;
+  if (status.paused) return "Paused by you";
+  if (status.flat_asked) return "Flat, as requested by you";
+  const [first, ...remarks] = reason.split("; ");
+  const well = { "eyes seen": "All is well", "no viewer": "All is well: nobody is in front of the display",
+    "eyes lost": "All is well: the eyes are out of sight for a moment" }[first];
+  const rest = remarks.filter((remark) => !remark.startsWith("keeping the last"));
+  return well && !rest.length ? well : well ? rest.join("; ") : `${state}: ${reason}`;
+}
+
+// While a scene or model is loading, say so next to the control, with the time since it began.
+function tellLoading({ loading }) {
+  loadingSince_ms = loading === undefined ? null : loadingSince_ms ?? performance.now();
+  const where = pending ?? $("scene-told");
+  if (loading !== undefined) {
+    where.dataset.kind = "loading";
+    setText(where, `${loading || "loading"} … ${number((performance.now() - loadingSince_ms) / 1000, 0)} s`);
+  } else if (!pending && where.dataset.kind === "loading") {
+    where.dataset.kind = "";
+    setText(where, "");
+  }
+}
+
+function clearErrors() {
+  for (const told of document.querySelectorAll('[data-kind="bad"]')) {
+    told.dataset.kind = "";
+    setText(told, "");
+  }
+}
+
+function allow(controls) {
+  for (const control of document.querySelectorAll("main :is(button, input, select)")) control.disabled = !controls;
+}
+
+const START = "To start the display, run: sudo systemctl start phasestack (or, by hand: phasestack run)";
+
 function gone(why, hangs = false) {
   running = false;
   $("gone").hidden = false;
-  setText($("gone"), `${hangs ? "The daemon is not responding" : "No daemon is running"}: ${why}`);
-  setText($("state"), hangs ? "not responding" : "no daemon");
+  setText($("gone"), hangs === null ? why : hangs ? `The daemon is not responding: ${why}` : `No daemon is running: ${why}. ${START}`);
+  allow(false);
+  for (const name of ["pause", "flat"]) document.querySelector(`[data-command=${name}]`).setAttribute("aria-pressed", "false");
+  setText($("state"), hangs ? "not responding" : hangs === null ? "no connection" : "no daemon");
   $("state").dataset.state = "gone";
   document.body.dataset.known = "last";
   setText($("reason"), "");
@@ -329,19 +386,21 @@ function gone(why, hangs = false) {
 }
 
 function show(status) {
-  if (!running) { // the daemon was missing until now, so clear the error messages
-    for (const told of document.querySelectorAll('[data-kind="bad"]')) setText(told, "");
-  }
+  if (!running) allow(true);
+  if (!running || (refusedBefore && !status.refused)) clearErrors(); // the daemon was missing or a later change succeeded
+  refusedBefore = Boolean(status.refused);
   running = true;
   document.body.dataset.known = "now";
   const hangs = status.turn_age_s > 5;
   $("gone").hidden = !hangs;
   if (hangs) setText($("gone"), `The display loop has not responded for ${number(status.turn_age_s, 0)} s. See the log: journalctl -u phasestack`);
+  const stopped = (status.paused || status.flat_asked) && !status.state?.startsWith("degraded"); // by the operator
   const reason = status.reason ?? "", late = /solutions take|has not answered for/.test(reason);
-  setText($("state"), hangs ? "not responding" : late ? "late" : status.state ?? "starting");
-  $("state").dataset.state = hangs ? "gone" : late ? "holding" : (status.state ?? "starting").split(":")[0];
+  setText($("state"), hangs ? "not responding" : late ? "late" : stopped ? (status.paused ? "paused" : "flat") : status.state ?? "starting");
+  $("state").dataset.state = hangs ? "gone" : late ? "late" : stopped ? "paused" : (status.state ?? "starting").split(":")[0];
   if (pictured && status.state !== pictured.state) lookAtPictures();
-  setText($("reason"), late ? `${reason}; use ${status.model === "fast" ? "" : "the model fast or "}panels with fewer pixels (the panels still follow the eyes)` : reason);
+  setText($("reason"), late ? `${reason}; use ${status.model === "fast" ? "" : "the model fast or "}panels with fewer pixels (the panels still follow the eyes)` : health(status));
+  tellLoading(status);
   if (status.state === undefined) return; // no refresh yet
   document.querySelector('[data-command="pause"]').setAttribute("aria-pressed", String(status.paused));
   document.querySelector('[data-command="flat"]').setAttribute("aria-pressed", String(status.flat_asked));
@@ -362,9 +421,9 @@ async function every(ms, work) {
   for (;;) {
     let pause = document.hidden ? 4 * ms : ms;
     try {
-      await work();
+      if ((await work()) === false) pause = RETRY_MS / 4; // the daemon's state is not known yet
     } catch {
-      gone("this page's server does not answer; it has stopped or the network is down");
+      gone("This page's server does not answer; it has stopped or the network is down", null);
       pause = RETRY_MS;
     }
     await new Promise((done) => setTimeout(done, pause));
@@ -381,14 +440,17 @@ every(PICTURES_MS, async () => {
   if (running && !document.hidden) await lookAtPictures();
 });
 every(LOG_MS, async () => {
-  if (!running) return;
+  if (!running) return false;
   const answer = await lookUp("log");
   if (!answer.ok) return;
   entries($("log"), answer.lines, (line) => [line.text, { level: line.level }]);
-  entries($("states"), answer.states, (s) => [`${s.state}: ${s.reason}`, { state: s.state.split(":")[0] }]);
+  const [faults, states] = [answer.faults ?? [], answer.states.filter((s) => !s.state.startsWith("degraded"))];
+  entries($("states"), states, (s) => [`${s.state}: ${s.reason}`, { state: s.state }]);
+  entries($("faulty"), faults, (s) => [s.reason + (s.file ? `; black box: ${s.file}` : ""), { state: "degraded" }]);
+  if (answer.states.at(-1)?.state.startsWith("degraded")) faultSince_s = answer.states.at(-1).time_s;
 });
 every(ABOUT_MS, async () => {
-  if (!running) return;
+  if (!running) return false;
   const answer = await lookUp("about");
   if (!answer.ok) return;
   about = answer;
@@ -401,6 +463,7 @@ every(ABOUT_MS, async () => {
 
 async function tell(button, command, value = null, where = $("told")) {
   if (button) button.disabled = true;
+  if (["scene", "model", "reload"].includes(command)) pending = where;
   where.dataset.kind = "";
   setText(where, `${command}: sent`);
   let done = false;
@@ -412,15 +475,17 @@ async function tell(button, command, value = null, where = $("told")) {
     });
     const said = await answer.json();
     done = said.ok === true;
+    if (done) clearErrors();
     where.dataset.kind = said.ok ? "" : "bad";
     setText(where, said.ok ? `${command}: done${said.file ? `: ${said.file}` : said.note ? `: ${said.note}` : ""}` : `${command}: ${said.error}`);
   } catch {
     where.dataset.kind = "bad";
     setText(where, `${command}: this page's server does not answer`);
   } finally {
+    if (pending === where) pending = null;
     if (button) {
-      button.disabled = false;
-      button.focus();
+      button.disabled = !running;
+      if (document.activeElement === document.body) button.focus();
     }
   }
   return done;
@@ -433,7 +498,7 @@ for (const [id, choice] of Object.entries(CHOICES)) {
   for (const field of [choice.select, choice.other]) field.addEventListener("input", () => ($(id).dataset.touched = "yes"));
   $(`${id}-form`).addEventListener("submit", async (event) => {
     event.preventDefault();
-    await tell(event.submitter ?? event.target.querySelector("button"), id, choice.value, $(`${id}-told`));
-    delete $(id).dataset.touched;
+    const done = await tell(event.submitter ?? event.target.querySelector("button"), id, choice.value, $(`${id}-told`));
+    if (done) delete $(id).dataset.touched;
   });
 }
