@@ -99,6 +99,10 @@ say("flat", (await told("flat: done")) && (await statusIs((s) => s.flat_asked)))
 const pictured = (pattern) => until(async () => pattern.test(await page.textContent("#pictures-when")));
 say("pictures follow the state", await pictured(/^\d+:\d+:\d+, flat/));
 say("plots have an axis", await page.$$eval(".plot .most", (marks) => marks.some((m) => /\d/.test(m.textContent))));
+say("panels and eyes have a place", await until(async () => {
+  const text = await page.textContent("#pictures");
+  return text.includes("panel 1 (middle)") && text.includes("panel 2 (front)") && /left eye, \d+ cm away/.test(text);
+}));
 say("stages have a line each", (await page.textContent("#numbers .stages")).split("\n").length >= 3);
 say("unused modules are no savings", !(await page.textContent("#plan")).includes("optional parts"));
 await page.focus("[data-command=resume]");
@@ -172,6 +176,7 @@ process.kill((await now()).processes.find((one) => one.role === "solver").pid, "
 say("a fault is told", await shows("#reason", "Fault since "));
 say("faults have their black box", await until(async () => /was ended by SIGKILL.*; black box: \/.*-fault-model\.mcap/.test(await page.textContent("#faulty"))));
 await page.setViewportSize({ width: 1440, height: 900 });
+await page.evaluate(() => window.scrollTo(0, 0));
 await page.screenshot({ path: `${folder}/page-1440.png` });
 await page.screenshot({ path: `${folder}/page-1440-full.png`, fullPage: true });
 await page.setViewportSize({ width: 1280, height: 900 });
@@ -186,6 +191,7 @@ say("it says that the daemon is gone", (await until(() => page.isVisible("#gone"
 say("it says how to start one", (await page.textContent("#gone")).includes("sudo systemctl start phasestack"));
 say("without a daemon, controls are disabled", await page.$$eval("main :is(button, input, select)", (all) =>
   all.every((control) => control.disabled && control.getAttribute("aria-pressed") !== "true")));
+await page.evaluate(() => window.scrollTo(0, 0));
 await page.screenshot({ path: `${folder}/page-gone.png` });
 await parent("start");
 say("it goes on when it is back", (await until(() => page.isHidden("#gone"))) && (await shows("#numbers", "presented")));

@@ -190,9 +190,9 @@ const NAMED = (name, count) => name.startsWith("layer-") ? `panel ${name.slice(6
   name === "seen-left" ? "seen by the left eye" : "seen by the right eye";
 
 // Where an eye is, as seen by the viewer.
-function placeOf([out, right, up]) {
+function placeOf([out, right]) {
   const cm = (value) => `${Math.abs(100 * value).toFixed(0)} cm`;
-  return `${cm(out)} in front, ${cm(right)} ${right < 0 ? "left" : "right"}, ${cm(up)} ${up < 0 ? "down" : "up"}`;
+  return `${cm(out)} away, ${cm(right)} to the ${right < 0 ? "left" : "right"}`;
 }
 
 function pictures(answer) {
@@ -216,7 +216,7 @@ function pictures(answer) {
     image.hidden = false;
     if (data) image.src = `data:image/jpeg;base64,${data}`;
     const eye_m = answer.eyes_m?.[name === "seen-left" ? 0 : 1];
-    const seen = name.startsWith("seen-") && eye_m ? `, from ${placeOf(eye_m)}` : "";
+    const seen = name.startsWith("seen-") && eye_m ? `, ${placeOf(eye_m)}` : "";
     setText(caption, NAMED(name, count) + (data ? seen : ": no viewer"));
   }
   box.dataset.frame = answer.frame ?? "";
