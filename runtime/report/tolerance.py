@@ -328,7 +328,7 @@ IMPERFECTIONS = (
         lambda nm, _: _cells(retardance_nm=nm),
     ),
     Imperfection(
-        "kind of cell", "", (0, 1, 2, 3, 4), 2.0, 1.0, "retarders between quarter-wave films (other panels)",
+        "kind of cell", "", (0, 1, 2, 3, 4), 2.0, 1.0, "rotators or retarders (other panels)",
         lambda choice, stack: cell_choice(choice, stack.count),
         "retarders of one domain; twisted nematic at the first minimum; half-wave plates that turn (IPS)",
         choices=("rotators", "retarders", "twisted nematic", "half-wave plates", "these, alternately inverted"),
