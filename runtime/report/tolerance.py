@@ -242,8 +242,20 @@ def _contrast(percent: float) -> float:
 def _filters(choice: float, stack: PanelStack) -> RealPanels:
     if not choice:
         return RealPanels()
-    filters = tuple(n == 0 or choice == 3 for n in range(stack.count)) if choice != 1 else (False,) * stack.count
+    filters = {1.0: (False,) * stack.count, 2.0: _fewer_filters(stack), 3.0: (True,) * stack.count}[float(choice)]
     return RealPanels(optics=Optics(filters=filters, aperture=APERTURE))
+
+
+def _fewer_filters(stack: PanelStack) -> tuple[bool, ...]:
+    """Return which panels keep their filters: those of the configuration, or the rear one alone."""
+    return stack.colour or tuple(n == 0 for n in range(stack.count))
+
+
+def _brighter(lux: float, stack: PanelStack) -> RealPanels:
+    """Return panels under a room's light in front of a monitor of 300 cd/m²; a filter transmits 85% of a third."""
+    further = max(sum(_fewer_filters(stack)) - 1, 0)
+    white_cd_m2 = 300.0 * APERTURE ** (stack.count - 1) * (0.85 / 3) ** further
+    return RealPanels(lighting=Lighting(room_lux=lux, white_cd_m2=white_cd_m2))
 
 
 def cell_choice(choice: float, count: int) -> RealPanels:
@@ -274,7 +286,7 @@ def _upside_down(share: float, stack: PanelStack) -> RealPanels:
 
 
 APERTURE = 0.6
-REAR_FILTERS_CD_M2 = 300.0 * APERTURE**2  # full white of a monitor of 300 cd/m² behind two panels without filters
+FEWER = "colour filters on the rear panel alone, or as stack.colour"
 REGISTRATION = "registration (calibrate panels)"
 # The assumed sizes describe three 27-inch monitors that are mounted by hand (docs/planning.md says where from).
 IMPERFECTIONS = (
@@ -334,9 +346,9 @@ IMPERFECTIONS = (
         choices=("rotators", "retarders", "twisted nematic", "half-wave plates", "these, alternately inverted"),
     ),
     Imperfection(
-        "pixels", "", (0, 1, 2, 3), 3.0, 2.0, "colour filters on the rear panel alone (other panels)", _filters,
-        "an open area of 60 %, except without lines",
-        choices=("no black lines", "no filters", "filters on the rear", "filters on all"),
+        "pixels", "", (0, 1, 2, 3), 3.0, 2.0, FEWER, _filters,
+        "a panel without filters shows one value for all colours, which is counted only if stack.colour says so",
+        choices=("no black lines", "no filters", "fewer filters", "filters on all"),
     ),
     Imperfection(
         "diffraction at the pixels", "", (0, 1), 1.0, 1.0, "",
@@ -352,9 +364,9 @@ IMPERFECTIONS = (
         lambda percent, _: RealPanels(optics=Optics(reflectance=percent / 100)), "4.3 %: uncoated glass",
     ),
     Imperfection(
-        "light of the room", "lx", (0, 5, 10, 20, 50, 100), 10.0, 10.0, "colour filters on the rear panel alone",
-        lambda lux, _: RealPanels(lighting=Lighting(room_lux=lux)), "full white of 9 cd/m², then of 108 cd/m²",
-        lambda lux, _: RealPanels(lighting=Lighting(room_lux=lux, white_cd_m2=REAR_FILTERS_CD_M2)),
+        "light of the room", "lx", (0, 5, 10, 20, 50, 100), 10.0, 10.0, FEWER,
+        lambda lux, _: RealPanels(lighting=Lighting(room_lux=lux)),
+        "full white of 9 cd/m², then of 108 with filters on the rear alone", _brighter,
     ),
     Imperfection(
         "backlight darker in the corners", "%", (0, 5, 10, 20, 30, 50), 20.0, 20.0, "",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -108,6 +109,18 @@ def test_imperfections_together_keep_each_one() -> None:
     assert everything.cell(0).white_deg == 85.0
     assert everything.optics.filters == (True, True, True)
     assert everything.timing.response_ms == 2.5
+
+
+def test_configured_filters_are_the_remedy() -> None:
+    (pixels, room) = (one for one in IMPERFECTIONS if one.name in ("pixels", "light of the room"))
+    stack = PanelStack(0.5, 0.3, (-0.03, 0.0, 0.03), 64, 36)
+    for colour, filters, white_cd_m2 in (
+        ((), (True, False, False), 108.0),
+        ((True, True, False), (True, True, False), 30.6),
+    ):
+        configured = replace(stack, colour=colour)
+        assert pixels.after(configured).optics.filters == filters
+        assert room.after(configured).lighting.white_cd_m2 == pytest.approx(white_cd_m2)
 
 
 def test_patches_up_to_four_parallaxes_have_no_crosstalk_in_theory() -> None:
