@@ -399,7 +399,7 @@ function show(status) {
   setText($("state"), hangs ? "not responding" : late ? "late" : stopped ? (status.paused ? "paused" : "flat") : status.state ?? "starting");
   $("state").dataset.state = hangs ? "gone" : late ? "late" : stopped ? "paused" : (status.state ?? "starting").split(":")[0];
   if (pictured && status.state !== pictured.state) lookAtPictures();
-  setText($("reason"), late ? `${reason}; use ${status.model === "fast" ? "" : "the model fast or "}panels with fewer pixels (the panels still follow the eyes)` : health(status));
+  setText($("reason"), hangs ? "" : late ? `${reason}; use ${status.model === "fast" ? "" : "the model fast or "}panels with fewer pixels (the panels still follow the eyes)` : health(status));
   tellLoading(status);
   if (status.state === undefined) return; // no refresh yet
   document.querySelector('[data-command="pause"]').setAttribute("aria-pressed", String(status.paused));
