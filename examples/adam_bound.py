@@ -24,7 +24,7 @@ STEPS = 24
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("pictures", nargs=2, type=Path, metavar=("LEFT", "RIGHT"))
+    parser.add_argument("pictures", nargs=2, type=Path, metavar="PICTURE", help="left and right")
     parser.add_argument("--panels", type=Path, required=True)
     parser.add_argument("--left-eye", nargs=3, type=float, required=True)
     parser.add_argument("--right-eye", nargs=3, type=float, required=True)

@@ -343,7 +343,7 @@ def evaluate(
         fov_deg: The pictures' horizontal field of view, in degrees.
         cameras: The pictures' cameras, as in `solve`.
         panels: Imperfections of real panels. Only `light_db` is then measured, for a tracking error of 1 mm and at some
-            20,000 pixels unless `how` says otherwise; the other figures are NaN.
+            20,000 pixels unless `how` says otherwise; the other figures are NaN, and there is no standard error.
         **how: Options that make the measurement faster. `evaluate(..., sigmas_mm=(1,), every=4)` measures only a
         tracking error of 1 mm, at every 4th pixel of every 4th row, and also gives the light PSNR's standard error.
         SSIM is then NaN.
@@ -365,6 +365,9 @@ def evaluate(
             "by pi/2"
         )
     codes = [as_codes(as_picture(f"layers[{n}]", layer[..., :3])) for n, layer in enumerate(given)]
+    for n, layer in enumerate(codes):
+        if pair.stack.is_grey(n) and np.ptp(layer, axis=2).max() > 0:
+            raise ValueError(f"layers[{n}]: this panel has no colour filters, so its three channels must be equal")
     if panels is not None:
         return _on_real_panels(pair, np.stack(codes), panels, how)
     return _measured(pair.judged(np.stack(codes)), how)

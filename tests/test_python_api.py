@@ -587,6 +587,26 @@ def test_more_steps_serve_the_eyes_better(model: str) -> None:
     assert light_db() > 25
 
 
+def test_more_steps_serve_one_eye_better_too() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        few, many = (
+            phasestack.solve([PAIR.left], stack=PAIR.stack, eyes_m=PAIR.eyes_m[:1], fov_deg=PAIR.fov_deg, steps=steps)
+            .measure(sigmas_mm=(0,), every=8).light_db["0"]
+            for steps in (1, 8)
+        )  # fmt: skip
+    assert few + 1 < many
+
+
+def test_coloured_layers_of_a_panel_without_filters_are_refused() -> None:
+    stack = replace(STACK, colour=(True, True, False))
+    layers = np.zeros((3, STACK.height_px, STACK.width_px, 3), np.uint8)
+    phasestack.evaluate(layers, picture(), picture(3), eyes_m=EYES, stack=stack, sigmas_mm=(0,), every=8)
+    layers[2, :, :, 0] = 9
+    with pytest.raises(ValueError, match=r"^layers\[2\]: this panel has no colour filters"):
+        phasestack.evaluate(layers, picture(), picture(3), eyes_m=EYES, stack=stack)
+
+
 @pytest.mark.parametrize("model", ["fast", "sart"])
 def test_float_layers_are_the_layers_before_rounding(model: str, tmp_path: Path) -> None:
     assert solution(PAIR.left, PAIR.right, **SHOWN, model=model).floats is None

@@ -93,6 +93,9 @@ def stored_run(method: Method, pair: StillPair) -> MethodRun:
         if layer.shape[:2] != size:
             shape = f"{layer.shape[1]}x{layer.shape[0]} pixels, but the case's panels have {size[1]}x{size[0]}"
             raise InputError(folder / pair.name / f"layer-{n}.png", "", f"has {shape}")
+        if pair.stack.is_grey(n) and np.ptp(layer[..., :3], axis=2).max() > 0:
+            problem = "is coloured, but the case's panel has no colour filters"
+            raise InputError(folder / pair.name / f"layer-{n}.png", "", problem)
     return MethodRun(np.stack([layer[..., :3] for layer in layers]), (float(time_ms),), math.nan, 0, "")
 
 

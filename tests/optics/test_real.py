@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -339,6 +340,22 @@ def test_a_late_front_panel_costs_light_only_when_the_head_moves() -> None:
 def test_entries_that_do_not_fit_the_stack_are_refused() -> None:
     with pytest.raises(ValueError, match=r"panels\.cells: must have 1 or 3 entries, but has 2"):
         real_light(smooth_layers(), STACK, RealPanels(cells=(Cell(), Cell())), sight(), RealSampling())
+
+
+@pytest.mark.parametrize(
+    ("panels", "problem"),
+    [
+        (RealPanels(cells=(Cell(kind="va"),)), "cells: kind: 'va' is unknown; use rotator, twisted-nematic,"),  # type: ignore[arg-type]
+        (RealPanels(cells=(Cell(contrast=-3.0),)), "cells: contrast: must be at least 1, but is -3"),
+        (RealPanels(cells=(Cell(bits=0),)), "cells: bits: must be from 1 to 8, but is 0"),
+        (RealPanels(optics=Optics(haze=25.0)), "optics.haze: must be a share from 0 to 1, but is 25"),
+        (RealPanels(optics=Optics(aperture=0.0)), "optics.aperture: must be above 0, but is 0"),
+        (RealPanels(timing=Timing(response_ms=-1.0)), "timing.response_ms: must be at least 0, but is -1"),
+    ],
+)
+def test_values_that_are_not_possible_are_refused(panels: RealPanels, problem: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(f"panels.{problem}")):
+        panels.check(3)
 
 
 def test_a_variable_retarder_between_quarter_wave_plates_is_a_rotator() -> None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -45,6 +45,22 @@ class Cell:
     retardance_axis_deg: float = 45.0  # slow axis of the residual retardance, from x towards y
     contrast: float = math.inf  # full white divided by black, of this cell between crossed ideal polarizers
     inverted: bool = False  # the panel shows 1 - value
+
+    def check(self) -> None:
+        """Raise ValueError, naming the field, if a value is not possible."""
+        for name, value, known in (("kind", self.kind, get_args(Kind)), ("curve", self.curve, get_args(Curve))):
+            if value not in known:
+                raise ValueError(f"{name}: {value!r} is unknown; use {', '.join(known)}")
+        for name, is_possible, wanted in (
+            ("black_deg", -90 <= self.black_deg <= 90, "must be from -90 to 90"),
+            ("white_deg", -180 <= self.white_deg <= 180, "must be from -180 to 180"),
+            ("gamma_ratio", 0 < self.gamma_ratio < math.inf, "must be above 0"),
+            ("bits", 1 <= self.bits <= 8, "must be from 1 to 8"),
+            ("mauguin", 0 < self.mauguin < math.inf, "must be above 0"),
+            ("contrast", self.contrast >= 1, "must be at least 1"),
+        ):
+            if not is_possible:
+                raise ValueError(f"{name}: {wanted}, but is {getattr(self, name):g}")
 
     @property
     def depolarized(self) -> float:

@@ -97,7 +97,7 @@ class RealPanels:
         return _of(self.placement, index)
 
     def check(self, count: int) -> None:
-        """Raise ValueError, naming the field, if an entry's length does not fit a stack of `count` panels."""
+        """Raise ValueError, naming the field, if a value is not possible or does not fit a stack of `count` panels."""
         lengths = {"cells": len(self.cells), "placement": len(self.placement)}
         for name, length in lengths.items():
             if length not in (1, count):
@@ -108,6 +108,28 @@ class RealPanels:
         for name, entries in optional.items():
             if entries and len(entries) != count:
                 raise ValueError(f"panels.{name}: must have {count} entries, but has {len(entries)}")
+        for cell in self.cells:
+            try:
+                cell.check()
+            except ValueError as error:
+                raise ValueError(f"panels.cells: {error}") from None
+        optics, lighting = self.optics, self.lighting
+        shares = {
+            "optics.haze": optics.haze, "optics.aperture": optics.aperture, "optics.reflectance": optics.reflectance,
+            "lighting.falloff": lighting.falloff, "lighting.room_reflectance": lighting.room_reflectance,
+            "timing.scan": timing.scan,
+        }  # fmt: skip
+        for name, share in shares.items():
+            if not 0 <= share <= 1:
+                raise ValueError(f"panels.{name}: must be a share from 0 to 1, but is {share:g}")
+        positive = {"optics.aperture": optics.aperture, "optics.index": optics.index, "timing.rate_hz": timing.rate_hz}
+        for name, value in positive.items():
+            if not 0 < value < math.inf:
+                raise ValueError(f"panels.{name}: must be above 0, but is {value:g}")
+        least = {"optics.glass_mm": optics.glass_mm, "timing.response_ms": timing.response_ms}
+        for name, value in least.items():
+            if not 0 <= value < math.inf:
+                raise ValueError(f"panels.{name}: must be at least 0, but is {value:g}")
 
 
 def _of(entries: tuple[T, ...], index: int) -> T:
