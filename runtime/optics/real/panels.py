@@ -97,7 +97,7 @@ class RealPanels:
         return _of(self.placement, index)
 
     def check(self, count: int) -> None:
-        """Raise ValueError, naming the field, if a value is not possible or does not fit a stack of `count` panels."""
+        """Raise ValueError, naming the field, if a value is not possible or does not fit `count` panels."""
         lengths = {"cells": len(self.cells), "placement": len(self.placement)}
         for name, length in lengths.items():
             if length not in (1, count):
