@@ -338,7 +338,7 @@ function health(status) {
   if (status.flat_asked) return "Flat, as requested by you";
   const [first, ...remarks] = reason.split("; ");
   const well = { "eyes seen": "All is well", "no viewer": "All is well: nobody is in front of the display",
-    "eyes lost": "All is well: the eyes are out of sight for a moment" }[first];
+    "eyes lost": "All is well: eyes out of sight for a moment" }[first];
   const rest = remarks.filter((remark) => !remark.startsWith("keeping the last"));
   return well && !rest.length ? well : well ? rest.join("; ") : `${state}: ${reason}`;
 }
