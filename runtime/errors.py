@@ -124,7 +124,8 @@ def retry_advised() -> Iterator[None]:
     except Exception as error:
         if isinstance(error, TransientError) or not is_retryable(error):
             raise
-        raise TransientError(f"{str(error) or type(error).__name__} (temporary: try again)") from error
+        reason = str(error) or ("not enough memory" if isinstance(error, MemoryError) else type(error).__name__)
+        raise TransientError(f"{reason} (temporary: try again)") from error
 
 
 def is_retryable(error: BaseException | None) -> bool:

@@ -36,7 +36,7 @@ from runtime.support.channel import shared_memory
 from runtime.support.process import Began, Ended, Role, Worker
 
 LATE_S = 0.5  # a longer step is late; a single step of more than twice this length is a fault
-ORDER_LATE_S = 10.0  # an order, such as to show another scene, that takes longer is a fault
+CHANGE_LATE_S = 10.0  # an order, or the first solution of another scene or model, that takes longer is a fault
 LATE_STEPS = 3  # this many late steps in a row are a fault; this many steps in a row on time clear it
 ANSWER_STEP_MS = 500  # the reported time without an answer is rounded down to a multiple of this
 REPLACED = "the solver was restarted with the old settings because it had ended or hung"
@@ -80,6 +80,7 @@ class SolverProcess(SolverHost):
         self._since_ns = clock.now_ns()  # when the solver ended, or began to work
         self._took_ns: deque[int] = deque(maxlen=LATE_STEPS)  # durations of the latest steps
         self._is_late = False
+        self._is_new = False  # True until the first solution after a change of the scene or model
         self._lost_before = 0
         self._worker = Worker(role, lambda: (self._memory, self._setup(self._known)), files=(self._memory,))
 
@@ -168,6 +169,7 @@ class SolverProcess(SolverHost):
 
     def _take_answer(self, answer: Answer) -> None:
         if isinstance(answer, Done) and answer.facts is not None:
+            self._is_new = True
             self._known = replace(self._known, facts=answer.facts)
         self._drawing.discard(answer.number)
         self._answered(answer)
@@ -180,8 +182,9 @@ class SolverProcess(SolverHost):
         self._costs, self._live, self._busy = message.costs, message.live, None
         if self._known.facts is not None:  # they come after the first step
             self._known = replace(self._known, facts=replace(self._known.facts, info=message.info))
-        if message.took_ns:
+        if message.took_ns and not self._is_new:
             self._took_ns.append(message.took_ns)
+        self._is_new = self._is_new and update.solution is None
 
     def _received(self, solution: Solution | None, slot: Slot | None) -> Solution | None:
         if solution is None or slot is None:
@@ -207,8 +210,8 @@ class SolverProcess(SolverHost):
             return f"{fault} (for {gone_ms} ms)" if gone_ms else fault
         busy = self._busy
         busy_ns = now_ns - busy.since_ns if busy is not None else 0
-        is_order = busy is not None and busy.effort is None
-        if busy_ns > (ORDER_LATE_S * NS_PER_S if is_order else 2 * self._late_ns):
+        is_slow = self._is_new or (busy is not None and busy.effort is None)
+        if busy_ns > (CHANGE_LATE_S * NS_PER_S if is_slow else 2 * self._late_ns):
             return f"the solver has not answered for {_rounded_ms(busy_ns)} ms"
         steps = tuple(self._took_ns)
         late = sum(took_ns > self._late_ns for took_ns in steps)

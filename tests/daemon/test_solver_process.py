@@ -163,13 +163,20 @@ def test_a_scene_that_hangs_or_crashes_while_it_loads_is_refused(rig: Rig, deed:
     assert rig.presenter.solver.facts.settings.content.options == {"file": str(deed)}
 
 
-def test_a_scene_that_takes_seconds_to_take_over_is_no_fault(rig: Rig, deed: Path) -> None:
+@pytest.mark.parametrize("making", [True, False])
+def test_a_scene_that_takes_seconds_to_take_over_is_no_fault(rig: Rig, deed: Path, making: bool) -> None:
     settings, faults = rig.presenter.state.settings, dict(rig.presenter.stats.faults)
-    options = {"file": str(deed), "making": True}
-    deed.write_text("nap")
+    other = deed.with_name("other")  # the present scene must not do it
+    options = {"file": str(other), "making": making}
+    other.write_text("nap")
     content = settings.content.model_copy(update={"options": options})
-    assert not problem_of(rig, ChangeSettings(settings.model_copy(update={"content": content})))
-    assert rig.presenter.stats.faults == faults
+    reasons: set[str] = set()
+    answers: list[Answer] = []
+    rig.presenter.solver.send(ChangeSettings(settings.model_copy(update={"content": content})), answers.append)
+    rig.refresh_until(lambda: reasons.add(rig.presenter.machine.reason) or any(isinstance(a, Done) for a in answers))
+    rig.refresh_until(lambda: reasons.add(rig.presenter.machine.reason) or not other.exists())
+    rig.refresh_until_solved()
+    assert rig.presenter.stats.faults == faults, reasons
     assert not problem_of(rig, ChangeSettings(settings))
 
 
