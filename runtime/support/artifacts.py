@@ -7,6 +7,7 @@ import fcntl
 import io
 import json
 import os
+import secrets
 import shutil
 import stat
 import tempfile
@@ -23,8 +24,6 @@ from runtime.errors import InputError
 from runtime.records import F32, U8
 
 STAGING = ".phasestack-staging-"
-UMASK = os.umask(0o022)  # the system reports the mask only when it is set
-os.umask(UMASK)
 
 
 def sync(path: Path) -> None:
@@ -53,7 +52,8 @@ def write_bytes(path: Path, data: bytes | memoryview, *, like: Path | None = Non
         if path.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+        name = path.parent / f".{path.name}.{secrets.token_hex(4)}"
+        handle = os.open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600 if before else 0o666)
     except OSError as error:
         raise InputError(path, "", f"cannot be written: {error.strerror}") from None
     try:
@@ -62,13 +62,13 @@ def write_bytes(path: Path, data: bytes | memoryview, *, like: Path | None = Non
         if before is not None:
             with suppress(PermissionError):  # the replaced file may belong to another user
                 os.chown(name, before.st_uid, before.st_gid)
-        Path(name).chmod(0o666 & ~UMASK if before is None else stat.S_IMODE(before.st_mode))
+            name.chmod(stat.S_IMODE(before.st_mode))
         if any(part.startswith(STAGING) for part in path.parts):  # OutputFolder syncs its files when it exits
-            Path(name).replace(path)
+            name.replace(path)
         else:
-            put_in_place(Path(name), path)
+            put_in_place(name, path)
     except BaseException as error:
-        Path(name).unlink(missing_ok=True)
+        name.unlink(missing_ok=True)
         if isinstance(error, OSError):  # for example because the disk is full
             raise InputError(path, "", f"cannot be written: {error.strerror}") from None
         raise

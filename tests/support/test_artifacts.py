@@ -153,8 +153,8 @@ def test_an_error_that_the_disk_has_no_room_for_leaves_no_file(tmp_path: Path, m
 @pytest.mark.parametrize("mask", [0o027, 0o077, 0o022])
 def test_new_files_keep_the_umask(tmp_path: Path, mask: int) -> None:
     code = (
-        f"import os; os.umask({mask}); from pathlib import Path; from runtime.support.artifacts import write_text; "
-        f"write_text(Path({str(tmp_path / 'a')!r}), 'x')"
+        f"import os; from pathlib import Path; from runtime.support.artifacts import write_text; "
+        f"os.umask({mask}); write_text(Path({str(tmp_path / 'a')!r}), 'x')"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
     assert (tmp_path / "a").stat().st_mode & 0o777 == 0o666 & ~mask
