@@ -88,9 +88,9 @@ def read_mesh(path: Path, data: bytes, read: Read, origin: Origin) -> tuple[list
     resolver = FolderResolver(
         path, read, has_materials=mark in data.replace(b"\0", b"") if data[:2] in BOMS else mark in data
     )
-    data = _without_comments(path, kind, data)
-    file = io.StringIO(_text(data)) if kind == "obj" else io.BytesIO(data)
     try:
+        data = _joined(data) if kind == "off" else _without_comments(path, kind, data)
+        file = io.StringIO(_text(data)) if kind == "obj" else io.BytesIO(data)
         scene = trimesh.load_scene(file, file_type=kind, resolver=resolver, process=False)
         meshes = [(scene.geometry[name], matrix) for matrix, name in map(scene.graph.get, scene.graph.nodes_geometry)]
         has_faces = any(len(getattr(mesh, "faces", ())) for mesh, _ in meshes)
@@ -126,6 +126,21 @@ def _without_comments(path: Path, kind: str, data: bytes) -> bytes:
         start = header.starts_at
         return data[:start] + re.sub(rb"^[ \t\r]*(?:comment.*)?(?:\n|$)", b"", data[start:], flags=re.MULTILINE)
     return data
+
+
+def _joined(data: bytes) -> bytes:
+    """Write each vertex and each face of an OFF file on one line, as trimesh expects them."""
+    kind, mark, numbers = re.sub(rb"#.*", b"", data).partition(b"OFF")
+    lines = [words for line in numbers.splitlines() if (words := line.split())]
+    records, record = [b" ".join(lines[0])] if lines else [], list[bytes]()
+    for words in lines[1:]:
+        record += words
+        if len(record) > (2 if len(records) <= int(lines[0][0]) else int(record[0])):
+            records.append(b" ".join(record))
+            record = []
+    if record and len(records) <= sum(map(int, lines[0][:2])):
+        raise EOFError
+    return kind + mark + b"\n" + b"\n".join(records) if records else data
 
 
 def _text(data: bytes) -> str:

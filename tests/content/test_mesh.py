@@ -342,6 +342,7 @@ TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
         ),
         ("a.obj", "v 0 0 0\nv 1 0 fish\nv 0 1 0\nf 1 2 3\n", "cannot be read as a mesh"),
         ("a.obj", TRIANGLE + "f 1 2 9\n", "cannot be read as a mesh"),
+        ("a.off", "OFF\n3 2 0\n0 0 0\n1 0 0\n0 1 0\n9 0 1 2\n3 0 1 2\n", "cannot be read as a mesh"),
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "faces: all faces have zero area"),
         ("a.stl", "\0" * 80 + "\7\0\0\0" + "\0" * 60, "faces: the file contains no faces"),
         ("a.stl", "solid x\n" + "facet normal 0 0 1\n" * 50, "faces: 50 exceeds the limit of 20"),
@@ -440,6 +441,14 @@ COMMENTED = {
     "a.stl": "# one\nsolid x # two\nfacet normal 0 0 1 # three\n outer loop\n vertex 0 0 0 # four\n"
     + " vertex 1 0 0 # five\n vertex 0 1 0\n endloop\nendfacet\nendsolid x\n",
 }
+
+
+@pytest.mark.parametrize("head", ["OFF\n4 1 0\n", "# one\nOFF 4 1 0 # counts\n", "OFF4 1 0\n"])
+def test_elements_of_an_off_file_may_take_several_lines(tmp_path: Path, head: str) -> None:
+    (tmp_path / "a.off").write_text(head + "0 0\n0\n1 0 0\n\n1 1 # corner\n0\n0 1 0\n4 0 1\n2\n3 255 0 0\n")
+    data = load_mesh(tmp_path / "a.off")
+    assert data.low.tolist() == [0, 0, 0] and data.high.tolist() == [1, 1, 0]
+    assert len(data.parts[0].shape.triangles) == 2
 
 
 @pytest.mark.parametrize("name", COMMENTED)
