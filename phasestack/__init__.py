@@ -5,7 +5,8 @@ from __future__ import annotations
 from phasestack import _rooms as _rooms  # must be the first import
 from phasestack.attaching import Attachment, attach
 from phasestack.example import ExamplePair, example_pair
-from phasestack.pair import Cameras, Eyes, Measuring, Result, camera, evaluate, project, solve, solve_each
+from phasestack.many import solve_each
+from phasestack.pair import Cameras, Eyes, Measuring, Result, camera, evaluate, project, solve
 from phasestack.pictures import find_eyes
 from phasestack.stack import Stack
 from runtime.content.base import ContentSource

@@ -5,14 +5,13 @@ from __future__ import annotations
 import html
 import math
 import os
-import sys
 import tempfile
 import time
 import warnings
 import webbrowser
-from collections.abc import Iterable, Iterator, Sequence, Sized
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from itertools import combinations
 from pathlib import Path
 from threading import RLock
@@ -39,7 +38,6 @@ from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack
 from runtime.records import F32, F64, U8
 from runtime.support.artifacts import OutputFolder, write_json
-from runtime.support.progress import ShownProgress
 from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG, SEPARATION_MIN_M, refusal
 from runtime.support.untrusted_input import checked_path
 
@@ -279,44 +277,6 @@ def solve(
             raise ValueError(f"eyes_m: {error}") from None
     name = predictor.name_with(len(codes))
     return Result(layers, pair, floats=solved.floats, model=name, eye_sigma_mm=eye_sigma_mm, total_ms=total_ms)
-
-
-def solve_each(
-    pairs: Iterable[tuple[ArrayLike, ArrayLike, Eyes]],
-    *,
-    stack: PanelStack,
-    fov_deg: float = 40.0,
-    model: str | Path = "balanced",
-    eye_sigma_mm: float = 1.0,
-    progress: bool = True,
-) -> Iterator[Result]:
-    """Solve many pairs (left picture, right picture, eyes_m) one after another, and yield each pair's
-    result.
-
-    Each pair is read only when its turn comes, so `pairs` may be a generator. The other arguments are those of `solve`;
-    `progress` is shown on stderr. Raises ValueError, which names the pair and the argument, for an invalid one.
-    """
-    total = len(pairs) if isinstance(pairs, Sized) else None
-    solve_one = partial(solve, stack=stack, fov_deg=fov_deg, model=model, eye_sigma_mm=eye_sigma_mm)
-    shown = ShownProgress(sys.stderr) if progress and sys.stderr is not None else None
-    if not isinstance(pairs, Iterable):
-        raise ValueError("pairs: must be an iterable of (left picture, right picture, eyes_m)")
-    try:
-        for number, pair in enumerate(pairs):
-            try:
-                left, right, eyes_m = pair
-            except (TypeError, ValueError):
-                raise ValueError(f"pairs[{number}]: must be (left picture, right picture, eyes_m)") from None
-            if shown is not None:
-                shown("solving", number, total)
-            try:
-                result = solve_one(left, right, eyes_m=eyes_m)
-            except ValueError as error:
-                raise ValueError(f"pairs[{number}]: {error}") from None
-            yield result
-    finally:
-        if shown is not None:
-            shown("", 0, None)
 
 
 def evaluate(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -11,6 +12,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -407,6 +409,32 @@ def test_many_pairs_are_solved_in_turn() -> None:
     assert len(results) == 3 and np.array_equal(results[2].layers, solution(eyes_m=places[2]).layers)
     with pytest.raises(ValueError, match=r"pairs\[1\]: eyes_m"):
         list(phasestack.solve_each([(picture(), picture(3), EYES), (picture(), picture(3), ())], stack=STACK))
+
+
+class Fatal:
+    """A picture that ends the process that receives it."""
+
+    def __reduce__(self) -> tuple[Any, tuple[int]]:
+        return os._exit, (9,)
+
+
+def test_an_executor_gives_the_same_and_a_failing_pair_ends_no_other(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """One of the processes dies, which breaks the pool."""
+    places = [np.add(EYES, (0.0, 0.02 * k, 0.0)) for k in range(3)]
+    pairs: list[Any] = [(picture(), picture(3), eyes) for eyes in places]
+    plain = [result.layers for result in phasestack.solve_each(pairs, stack=STACK, model="fast")]
+    pairs[1:1] = [(picture(), picture(3), ()), (Fatal(), picture(3), EYES)]
+    with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
+        results = list(phasestack.solve_each(pairs, stack=STACK, model="fast", executor=pool))
+    solved = [result.layers for result in results if isinstance(result, phasestack.Result)]
+    assert np.array_equal(solved, plain)
+    lines = [str(results[1]), str(results[2])]
+    assert lines[0].startswith("pairs[1]: eyes_m: must be") and lines[1] == "pairs[2]: its process died"
+    assert [line for line in capfd.readouterr().err.splitlines() if line.startswith("pairs[")] == lines
+    with pytest.raises(ValueError, match=r"^executor: must be"):
+        next(phasestack.solve_each(pairs, stack=STACK, executor=2))  # type: ignore[call-overload]
 
 
 FOUR_EYES = ((0.6, -0.24, 0.0), (0.6, -0.18, 0.0), (0.6, 0.18, 0.0), (0.6, 0.24, 0.0))

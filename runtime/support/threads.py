@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import cache
-from itertools import pairwise
+from itertools import islice, pairwise
 from typing import TypeVar
 
 import cv2
@@ -35,6 +36,16 @@ def on_rows(work: Callable[[int, int], None], rows: int, *, threads: int | None 
     """Split rows into `threads` parts, by default OpenCV's, for `work(begin, end)` in parallel."""
     parts = threads or max(1, cv2.getNumThreads())
     parallel_map(lambda span: work(*span), list(pairwise(rows * part // parts for part in range(parts + 1))))
+
+
+def ahead(items: Iterable[Item], count: int) -> Iterator[Item]:
+    """Yield the items in order, and read up to `count` of them in advance."""
+    source, waiting = iter(items), deque[Item]()
+    while True:
+        waiting.extend(islice(source, count - len(waiting)))
+        if not waiting:
+            return
+        yield waiting.popleft()
 
 
 def fresh_threads() -> None:
