@@ -135,23 +135,15 @@ class Video(Frames):
     """The frames of a film, decoded during playback and each shown at its own time."""
 
     def __init__(self, path: Path, settings: ContentSettings, times_ns: NDArray[np.int64] | None = None) -> None:
-        """Open a film, with its frames' times if known, and decode its first frame. Raises InputError if that fails."""
+        """Open a film, with its frames' times if known, and decode its first frame. Raises InputError."""
         from runtime.support.film import Film  # noqa: PLC0415 - PyAV is in an extra
 
         self._film, self._settings = Film(path, times_ns=times_ns), settings
         self._background = settings.background or DARK
         self.count = len(self._film.times_ns) - 1
         self._pictures: Iterator[Picture] = iter(())
-        self._index, self._shown_ns, self._last = self.count, -1, np.empty((0, 0, 3), np.uint8)
-        try:
-            picture = self.frame(0)
-            self.layouts = [_film_layout(self._film, settings, picture)]
-        except ContentFailure as failure:
-            self.close()
-            raise InputError(path, "frames", "the first frame cannot be decoded") from failure
-        except BaseException:
-            self.close()
-            raise
+        self._index, self._shown_ns, self._last = self.count, -NS_PER_S, np.empty((0, 0, 3), np.uint8)
+        self.layouts = [_film_layout(self._film, settings, self.frame(0))]
 
     def at(self, time_ns: int) -> int:
         times_ns = self._film.times_ns[: self.count + 1]
@@ -160,12 +152,12 @@ class Video(Frames):
     def frame(self, index: int) -> U8:
         film, wanted_ns = self._film, int(self._film.times_ns[index])
         if index < self._index or index > self._index + SKIPPED:
-            self._pictures, self._shown_ns = film.pictures(wanted_ns), -1
+            self._pictures, self._shown_ns = film.pictures(wanted_ns), -NS_PER_S
         self._index = index
-        if self._shown_ns >= wanted_ns:
+        if self._shown_ns > wanted_ns - NS_PER_MS:  # Matroska rounds times to milliseconds
             return self._last
         for time_ns, frames in self._pictures:
-            if time_ns >= wanted_ns:
+            if time_ns > wanted_ns - NS_PER_MS:
                 check_size(frames[0].width, frames[0].height, source=film.path)
                 views = frames[:1] if self._settings.layout == "mono" else frames
                 self._last, self._shown_ns = film.rgb(views, background=self._background), time_ns

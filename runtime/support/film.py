@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
+from heapq import heappop, heappush
+from itertools import chain
 from pathlib import Path
 from typing import Any, cast
 
@@ -24,12 +26,13 @@ from runtime.support.coded_colours import BRIGHT, Colour, composed, srgb_from
 
 CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
 COVER = 1024  # FFmpeg's AV_DISPOSITION_ATTACHED_PIC
+EARLIER_S = 1, 10, 100  # seek so much earlier if an index names frames that cannot be decoded alone
 FRAMES_MAX = 10_000_000  # most frames in a film: four days at 30 per second
 SCANNED_BYTES = 1 << 30  # in larger files, frames at a constant rate are not looked up one by one
 WITH_ALPHA = {"vp8": "libvpx", "vp9": "libvpx-vp9"}  # decoders of the transparency in WebM, which FFmpeg's own ignore
 STEREO = {1: "side-by-side", 2: "top-bottom"}  # FFmpeg's AVStereo3DType
-UNSEEN = {3: "alternating frames", 4: "checkerboard", 5: "quincunx", 6: "alternating rows", 7: "alternating columns"}
-SECOND_VIEW = 8  # AVStereo3DType of MV-HEVC, whose second view FFmpeg does not decode unless asked
+# FFmpeg's AVStereo3DType from 3 to 8
+UNSEEN = "alternating frames", "checkerboard", "quincunx", "alternating rows", "alternating columns", "MV-HEVC"
 HALF_EQUIRECTANGULAR = 3  # AVSphericalProjection
 
 # The camera may answer with a playlist (HLS), but not make FFmpeg open local files.
@@ -70,12 +73,10 @@ class Film:
 
     def __init__(self, path: Path, *, times_ns: NDArray[np.int64] | None = None) -> None:
         """Open a film, with the times (n + 1,) of its frames if known. Raises InputError."""
-        self.path = path
+        self.path, self._start_ns = path, 0
         self._container: Any = None
-        self._start_ns = 0
         first = next(self.pictures(), None)
         if first is None:
-            self.close()
             raise InputError(path, "frames", "the first frame cannot be decoded")
         self._start_ns = first[0]
         self.header = _header(first[1][0], self._streams)
@@ -83,8 +84,17 @@ class Film:
         self.times_ns = self._times() if times_ns is None else times_ns
 
     def _open(self) -> None:
+        """Open the file and choose the streams to show. Raises InputError if it is not a regular file or not a film.
+        FFmpeg is restricted to local files and video containers. Otherwise, a playlist or script with a film's suffix,
+        or a name that looks like a URL, could make FFmpeg open other files and network connections.
+        """
+        untrusted_input.open_regular(self.path).close()
+        options = {"protocol_whitelist": "file", "format_whitelist": CONTAINERS}
         self.close()
-        self._container = open_film(self.path)
+        try:
+            self._container = av.open(f"file:{self.path.absolute()}", options=options)
+        except (av.error.FFmpegError, UnicodeError):
+            raise InputError(self.path, "", "cannot be decoded as a film") from None
         self._choose()
 
     def _choose(self) -> None:
@@ -92,10 +102,11 @@ class Film:
         videos = [stream for stream in self._container.streams.video if stream.codec_context is not None]
         streams = [stream for stream in videos if not stream.disposition & COVER] or videos[:1]
         if not streams:
-            self.close()
             raise InputError(self.path, "", "cannot be decoded as a film: it has no pictures")
         views = {(s.codec_context.name, s.codec_context.width, s.codec_context.height) for s in streams}
         self._streams = streams if len(streams) == 2 and len(views) == 1 else streams[:1]
+        # AVI files state when frames are decoded, and only some codecs when they are shown.
+        self._has_no_times = self._container.format.name == "avi" and streams[0].codec_context.name in ("h264", "hevc")
         self._decoders: dict[int, Any] = {}
         for stream in self._streams:
             decoder, name = stream.codec_context, WITH_ALPHA.get(stream.codec_context.name, "")
@@ -106,39 +117,52 @@ class Film:
             self._decoders[stream.index] = decoder
 
     def _times(self) -> NDArray[np.int64]:
+        self._open()
         stream = self._streams[0]
         rate, size = float(stream.average_rate or 0), self.path.stat().st_size
         length_s = (self._container.duration or 0) / av.time_base
         if size > SCANNED_BYTES and rate and length_s and abs(float(stream.guessed_rate or 0) / rate - 1) < 1e-3:
             count = min(max(round(length_s * rate), 1), FRAMES_MAX)
             return np.asarray(np.rint(np.arange(count + 1) * (NS_PER_S / rate)), np.int64)
-        shown, decoded, last = [], [], 0
-        with open_film(self.path) as container, suppress(av.error.FFmpegError):
-            for packet in container.demux(container.streams[stream.index]):
+        stamps, last = [], 0
+        with suppress(av.error.FFmpegError):
+            for packet in self._container.demux(stream):
                 if packet.size and not packet.is_discard:
-                    shown.append(packet.pts)
-                    decoded.append(packet.dts)
+                    stamps.append(self._stamp(packet))
                     last = packet.duration or last
-                if len(shown) % 4096 == 1:
-                    untrusted_input.within(len(shown), FRAMES_MAX, source=self.path, field="frames")
-                    progress.tell(f"{self.path.name}: frames", len(shown))
-        stamps = decoded if None in shown and any(stamp is not None for stamp in decoded) else shown
+                if len(stamps) % 4096 == 1:
+                    untrusted_input.within(len(stamps), FRAMES_MAX, source=self.path, field="frames")
+                    progress.tell(f"{self.path.name}: frames", len(stamps))
         ticks = np.unique(np.array([stamp for stamp in stamps if stamp is not None] or [0], np.int64))
         gap = int(np.median(np.diff(ticks))) if len(ticks) > 1 else 0
         times_ns = np.append(ticks, ticks[-1] + max(last or gap, 1)) * (NS_PER_S * float(stream.time_base or 1))
-        times_ns = np.rint(times_ns - times_ns[0])
+        times_ns = np.rint(times_ns - self._start_ns)
+        times_ns = np.append(0, times_ns[times_ns > 1])  # without frames before the first that can be decoded
         if times_ns[-2] < length_s * NS_PER_S < times_ns[-1]:  # a rate that varies makes the last duration a guess
             times_ns[-1] = length_s * NS_PER_S
         return np.asarray(times_ns, np.int64)
+
+    def _stamp(self, coded: Any) -> Any:
+        return coded.dts if coded.pts is None or self._has_no_times else coded.pts
 
     def pictures(self, since_ns: int = 0) -> Iterator[Picture]:
         """Decode the pictures in order of time, from a given time or earlier, without damaged ones. Another
         iterator must not be in use.
         """
+        pictures, first = self._pictures(since_ns), None
+        for earlier_s in EARLIER_S if since_ns > 0 else ():
+            first = next(pictures, None)
+            if first is not None and first[0] <= since_ns + NS_PER_MS:
+                break
+            pictures = self._pictures(since_ns - earlier_s * NS_PER_S)
+        yield from pictures if first is None else chain([first], pictures)
+
+    def _pictures(self, since_ns: int) -> Iterator[Picture]:
+        """Decode the pictures from where the file's index places a time, which may be too late."""
         if since_ns > 0:
             stream = self._streams[0]
-            tick = int((since_ns + self._start_ns) / NS_PER_S / float(stream.time_base or 1))
             try:
+                tick = int((since_ns + self._start_ns) / NS_PER_S / float(stream.time_base or 1))
                 self._container.seek(tick, stream=stream)
                 for decoder in self._decoders.values():
                     decoder.flush_buffers()
@@ -151,35 +175,32 @@ class Film:
             waiting[index].append(frame)
             while all(waiting.values()):
                 frames = tuple(queue.popleft() for queue in waiting.values())
-                yield self._time_ns(frames[0]), frames
-
-    def _time_ns(self, frame: av.VideoFrame) -> int:
-        stamp, base = frame.pts if frame.pts is not None else frame.dts, frame.time_base
-        return 0 if stamp is None else round(stamp * float(base or 1) * NS_PER_S) - self._start_ns
+                stamp, base = frames[0].dts if frames[0].pts is None else frames[0].pts, frames[0].time_base
+                yield 0 if stamp is None else round(stamp * float(base or 1) * NS_PER_S) - self._start_ns, frames
 
     def _decoded(self) -> Iterator[tuple[int, av.VideoFrame]]:
         """Yield decoded frames with their stream's number. Interlaced frames are converted to progressive ones."""
         graphs: dict[int, Any] = {}
-        packets = self._container.demux(self._streams)
-        while True:
-            try:
-                packet = next(packets, None)
-                if packet is None:
-                    return
-                index = packet.stream.index
-                frames = self._decoders[index].decode(packet)
-            except av.error.EOFError:
-                return
-            except av.error.InvalidDataError:  # the next packet may be intact
-                continue
-            except av.error.FFmpegError:
-                return
-            for frame in frames:
-                if index not in graphs and frame.interlaced_frame:
-                    graphs[index] = _progressive(frame)
-                yield from ((index, one) for one in _filtered(graphs.get(index), frame))
-            if not packet.size:  # the stream's end
-                yield from ((index, one) for one in _filtered(graphs.pop(index, None), None))
+        stamps: dict[int, list[int]] = {index: [] for index in self._decoders}
+        with suppress(av.error.FFmpegError):
+            for packet in self._container.demux(self._streams):
+                index, frames = packet.stream.index, list[av.VideoFrame | None]()
+                if self._has_no_times and packet.dts is not None:
+                    heappush(stamps[index], packet.dts)
+                with suppress(av.error.InvalidDataError):  # the next packet may be intact
+                    frames += self._decoders[index].decode(packet)
+                for frame in frames if packet.size else [*frames, None]:
+                    if frame is not None and stamps[index]:
+                        frame.pts = heappop(stamps[index])
+                    if frame is not None and frame.interlaced_frame and index not in graphs:
+                        graphs[index] = _progressive(frame)
+                    if index in graphs:
+                        with suppress(av.error.BlockingIOError, av.error.EOFError):
+                            graphs[index].vpush(frame)
+                            while True:
+                                yield index, graphs[index].vpull()
+                    elif frame is not None:
+                        yield index, frame
 
     def rgb(self, frames: tuple[av.VideoFrame, ...], *, background: Colour = (0.0, 0.0, 0.0)) -> U8:
         """Convert frames to an upright (h, w, 3) picture over a background, with two views side by side."""
@@ -244,19 +265,6 @@ class FilmWriter:
         self._container.close()
 
 
-def open_film(path: Path) -> av.container.InputContainer:
-    """Open a film's container. Raises InputError if the path is not a regular file or is not a film.
-    FFmpeg is restricted to local files and video containers. Otherwise, a playlist or script with a film's suffix, or a
-    name that looks like a URL, could make FFmpeg open other files and network connections.
-    """
-    untrusted_input.open_regular(path).close()
-    options = {"protocol_whitelist": "file", "format_whitelist": CONTAINERS}
-    try:
-        return av.open(f"file:{path.absolute()}", options=options)
-    except (av.error.FFmpegError, UnicodeError):
-        raise InputError(path, "", "cannot be decoded as a film") from None
-
-
 def _header(frame: av.VideoFrame, streams: list[Any]) -> FilmHeader:
     """Return what a film declares, as FFmpeg reports it with the first frame."""
     stream, items = streams[0], cast(Any, frame.side_data)
@@ -265,15 +273,11 @@ def _header(frame: av.VideoFrame, streams: list[Any]) -> FilmHeader:
     layout = "cross-eyed" if STEREO.get(kind) == "side-by-side" and flags & 1 else STEREO.get(kind, "")
     if stream.metadata.get("stereo_mode", "").startswith("anaglyph_cyan"):
         layout = "anaglyph"
-    left_out = "its second view (MV-HEVC); convert it to side by side" if kind == SECOND_VIEW else ""
-    if kind in UNSEEN:
-        left_out = f"its second view ({UNSEEN[kind]}); convert it to side by side"
+    left_out = f"its second view ({UNSEEN[kind - 3]}); convert it to side by side" if 3 <= kind <= 8 else ""
     span_deg = 0
     if "SPHERICAL" in side:
-        projection, *_ = struct.unpack_from("<i", side["SPHERICAL"])
-        left, _, right = struct.unpack_from("<III", side["SPHERICAL"], 16)
-        is_half = projection == HALF_EQUIRECTANGULAR or left + right > (1 << 30)
-        span_deg = 180 if is_half else 360
+        projection, left, _, right = struct.unpack_from("<i12x3I", side["SPHERICAL"])
+        span_deg = 180 if projection == HALF_EQUIRECTANGULAR or left + right > (1 << 30) else 360
     aspect = float(stream.sample_aspect_ratio or 1) or 1.0
     aspect = aspect if frame.rotation % 180 == 0 else 1 / aspect
     return FilmHeader(layout, span_deg, left_out, aspect, len(streams))
@@ -286,17 +290,6 @@ def _progressive(frame: av.VideoFrame) -> Any:
     graph.link_nodes(source, graph.add("bwdif", "mode=send_frame:deint=interlaced"), graph.add("buffersink"))
     graph.configure()
     return graph
-
-
-def _filtered(graph: Any, frame: av.VideoFrame | None) -> Iterator[av.VideoFrame]:
-    """Pass a frame through a filter, if there is one. None marks the stream's end, and returns what is left."""
-    if graph is None:
-        yield from () if frame is None else (frame,)
-        return
-    graph.vpush(frame)
-    with suppress(av.error.BlockingIOError, av.error.EOFError):
-        while True:
-            yield graph.vpull()
 
 
 def _rgb(frame: av.VideoFrame, background: Colour) -> U8:

@@ -34,16 +34,17 @@ def write(
 ) -> Path:
     """A film of streams of pictures with their times in ms.
 
-    options: `form`, FFmpeg's name of the container; `aspect`, the pixels' width over height; others are the encoder's.
+    options: `form`, FFmpeg's name of the container; `aspect`, the pixels' width over height; `base` of the times in s,
+    else ms; others are the encoder's.
     """
-    form, aspect = options.pop("form", None), options.pop("aspect", None)
+    form, aspect, base = options.pop("form", None), options.pop("aspect", None), options.pop("base", Fraction(1, 1000))
     with av.open(str(path), "w", format=form) as out:
         made = []
         for pictures in streams:
             stream: Any = out.add_stream(codec, rate=options.pop("rate", 1000))
             stream.height, stream.width = pictures[0][1].shape[:2]
             stream.pix_fmt = pix_fmt
-            stream.codec_context.time_base = Fraction(1, 1000)
+            stream.codec_context.time_base = base
             stream.options = {name: str(value) for name, value in options.items()}
             if aspect is not None:
                 stream.codec_context.sample_aspect_ratio = aspect
@@ -52,7 +53,7 @@ def write(
             for at_ms, picture in pictures:
                 kind = "rgba" if picture.shape[2] == 4 else "rgb24"
                 frame = av.VideoFrame.from_ndarray(picture, format=kind).reformat(format=pix_fmt)
-                frame.pts, frame.time_base = at_ms, Fraction(1, 1000)
+                frame.pts, frame.time_base = at_ms, base
                 out.mux(stream.encode(frame))
             out.mux(stream.encode(None))
     return path
@@ -76,6 +77,37 @@ def test_every_frame_is_shown_at_its_own_time(tmp_path: Path, suffix: str) -> No
     assert np.abs(np.array(played(path, [499, 0, 999, 1000, 300])) - [levels[n] for n in (0, 0, 1, 2, 0)]).max() < 6
 
 
+def remuxed(given: Path, path: Path, *, indexed: bool = False, **options: str) -> Path:
+    """The same packets in another file. indexed: its index names every frame, as if each could be decoded alone."""
+    with av.open(str(path), "w", container_options=options) as out, av.open(str(given)) as container:
+        stream = out.add_stream_from_template(container.streams.video[0])
+        for packet in container.demux(video=0):
+            if packet.size:
+                packet.stream, packet.is_keyframe = stream, indexed or packet.is_keyframe
+                out.mux(packet)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("a.mp4", {"base": Fraction(1, 30000), "step": 1001}),  # times that are no whole number of ns
+        ("a.avi", {"base": Fraction(1001, 30000), "bf": 2}),
+        ("a.avi", {"base": Fraction(1001, 30000), "codec": "libx264", "g": 12}),  # AVI has no times for H.264
+        ("b.mkv", {"step": 33, "codec": "libx264"}),
+    ],
+)
+def test_frames_are_those_of_their_number_in_any_order(tmp_path: Path, name: str, options: dict[str, Any]) -> None:
+    step = options.pop("step", 1)
+    pictures = [(step * (n + 1), grey(20 + 20 * n)) for n in range(11)]
+    path = write(tmp_path / name.replace("b", "a"), pictures, rate=Fraction(30000, 1001), **options)
+    if name == "b.mkv":
+        path = remuxed(path, tmp_path / name, indexed=True)
+    frames = open_frames(path, AUTO)
+    order = [*range(11), 8, 3, 10, 1, 6]
+    assert [round((float(frames.frame(n).mean()) - 20) / 20) for n in order] == order
+
+
 @pytest.mark.parametrize("step_ms", [20_000, 100_000])
 def test_a_time_lapse_is_a_film(tmp_path: Path, step_ms: int) -> None:
     path = write(tmp_path / "a.mp4", [(n * step_ms, grey(60 * n + 30)) for n in range(3)])
@@ -85,16 +117,7 @@ def test_a_time_lapse_is_a_film(tmp_path: Path, step_ms: int) -> None:
 def test_a_recording_of_unknown_length_is_played_to_its_end(tmp_path: Path) -> None:
     """As browsers write it: WebM without a duration and an index."""
     pictures = [(100 * n, grey(20 * n + 20)) for n in range(8)]
-    path = write(tmp_path / "a.webm", pictures, codec="libvpx", form="webm", live=1)
-    with (
-        av.open(str(path), "w", format="webm", container_options={"live": "1"}) as out,
-        av.open(str(write(tmp_path / "b.webm", pictures, codec="libvpx"))) as given,
-    ):
-        stream = out.add_stream_from_template(given.streams.video[0])
-        for packet in given.demux(video=0):
-            if packet.size:
-                packet.stream = stream
-                out.mux(packet)
+    path = remuxed(write(tmp_path / "b.webm", pictures, codec="libvpx"), tmp_path / "a.webm", live="1")
     with av.open(str(path)) as container:
         assert container.duration is None
     assert np.abs(np.array(played(path, [0, 150, 750, 850])) - [20, 40, 160, 20]).max() < 8
