@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -29,6 +29,9 @@ def report(
     quick: Annotated[
         bool, typer.Option("--quick", help="measure only quarter-size panels and fewer reference methods")
     ] = False,
+    processes: Annotated[
+        int, typer.Option(min=1, max=1024, help="number of measurements at the same time (above 1, times are longer)")
+    ] = 1,
     as_json: JsonOption = False,
 ) -> None:
     """Measure every method's light PSNR and run time on this machine, and write a page with the results.
@@ -42,7 +45,7 @@ def report(
 
     Example: phasestack report --pairs my-pairs --only-pairs --layers my-solver --out report
     """
-    from runtime.errors import InputError
+    from runtime.errors import FatalError, InputError
     from runtime.report.assemble import Own, whole_report
     from runtime.support.artifacts import refuse_file, to_json
     from runtime.support.progress import status_line
@@ -54,12 +57,13 @@ def report(
     parts += [f"--model {Path(name).name}" for name in model or []]
     parts += [f"--layers {folder.name}" for folder in layers or []]
     parts += [*(["--only-pairs"] if only_pairs else []), *(["--quick"] if quick else [])]
+    parts += [f"--processes {processes}"] if processes > 1 else []
     try:
         with status_line("report") as tell:
             record = whole_report(
                 out,
                 pairs=pairs,
-                own=Own(only_pairs, tuple(layers or ())),
+                own=Own(processes, only_pairs, tuple(layers or ())),
                 with_focal=focal,
                 models=model or [],
                 quick=quick,
@@ -69,9 +73,16 @@ def report(
     except KeyboardInterrupt:
         typer.echo(f"report: interrupted; the measurements so far are in {out / 'index.html'}", err=True)
         raise
+    failed = len(record.get("failed", []))
     if as_json:
         print(to_json(record))
-        return
+    else:
+        _print_table(record, out)
+    if failed:
+        raise FatalError(f"report: {failed} measurement{'s' if failed > 1 else ''} failed; the others are in {out}")
+
+
+def _print_table(record: dict[str, Any], out: Path) -> None:
     for result in sorted(record["methods"], key=lambda r: (r["x_m"], r["width_px"], r["ms_p50"])):
         size = f"{len(result['x_m'])} panels {result['width_px']}x{result['height_px']}"
         light = result["light_db"].get("1", float("nan"))

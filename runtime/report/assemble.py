@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Callable, Iterable, Sequence
+import sys
+from collections.abc import Callable, Iterable, Sequence, Sized
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -12,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from runtime.config import StackGeometry
-from runtime.errors import InputError, MissingPart
+from runtime.errors import FatalError, InputError, MissingPart
 from runtime.model.predictor import SHIPPED
 from runtime.optics.stack import PanelStack
 from runtime.records import Effort
@@ -20,7 +21,7 @@ from runtime.report import focal, moving
 from runtime.report.benchmark import too_busy, yardstick_ms
 from runtime.report.frontier import Method, MethodResult, apart, given_layers, measure, shipped_and_references
 from runtime.report.page import Page, PageSection, describe
-from runtime.report.pairs import StillPair, procedural_pairs, read_pairs
+from runtime.report.pairs import PROCEDURAL, StillPair, procedural_pairs, read_pairs
 from runtime.report.sections import focal_section, frontier_section, moving_section
 
 QUOTE = "light_db at a tracking error of 1 mm, the mean over both eyes' pupils and pixels; for motion, live_db"
@@ -29,8 +30,9 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class Own:
-    """Options for the case files."""
+    """Options for the measurements and the case files."""
 
+    processes: int = 1  # number of methods on pairs that are measured at the same time
     only: bool = False  # True to measure only the case files, and no built-in scenes or motions
     layers: tuple[Path, ...] = ()  # folders with other solvers' layers for the case files (docs/contracts.md)
 
@@ -52,6 +54,11 @@ class GrowingPage:
         self._progress(what)
         self.record["measuring"] = what
 
+    def failed(self, what: str, error: FatalError) -> None:
+        """Print a failed measurement as a line, and enter it in the record."""
+        self.record["failed"] = [*self.record.get("failed", []), f"{what}: {error}"]
+        print(f"report: {what}: {error}", file=sys.stderr, flush=True)
+
     def put(self, name: str, section: PageSection) -> None:
         """Add a section under a name, or replace the existing section of that name, and write the files."""
         self._sections[name] = section
@@ -71,6 +78,9 @@ class GrowingPage:
             if doing
             else []
         )
+        notes += [
+            f"This measurement failed and is missing from the means: {one}." for one in self.record.get("failed", [])
+        ]
         if busy := too_busy(self.record["yardsticks_ms"]):
             notes.append(f"Do not compare these times or their ratios, because the machine was busy: {busy}.")
         sections, machine = list(self._sections.values()), self.record["machine"]
@@ -96,7 +106,7 @@ def whole_report(
     Case files in `pairs`, and models, are checked before the first measurement; `own` says what else is done with them,
     and `models` are measured in addition to the shipped ones. `quick` draws built-in scenes with a quarter of the
     pixels, omits the slowest reference and shortens motions. Raises InputError for a case file or a model, or if
-    results cannot be written, and FatalError if a measuring process failed.
+    results cannot be written. A measurement that fails is listed in the record's `failed`, and the others go on.
     """
     cases = read_pairs(pairs) if pairs is not None else []
     stack = StackGeometry().stack()
@@ -108,10 +118,11 @@ def whole_report(
     page = GrowingPage(out, command, progress)
     for number, (each, group) in enumerate(_by_stack(cases).items()):
         title = f"{len(group)} case file{'s' if len(group) > 1 else ''}, {_described(each)}"
-        _frontier(page, [*others, *methods], group, title=title, name=f"cases-{number + 1}", key="methods")
+        _frontier(page, [*others, *methods], group, title=title, name=f"cases-{number + 1}", processes=own.processes)
     if not own.only:
         key = "methods_on_built_in_scenes" if cases else "methods"
-        _frontier(page, methods, procedural_pairs(stack), title="built-in scenes", name="scenes", key=key)
+        scenes = procedural_pairs(stack)
+        _frontier(page, methods, scenes, title="built-in scenes", name="scenes", key=key, processes=own.processes)
         _moving(page, quick=quick)
     if with_focal:
         _focal(page)
@@ -147,15 +158,26 @@ def _described(stack: PanelStack) -> str:
 
 
 def _frontier(
-    page: GrowingPage, methods: Sequence[Method], pairs: Iterable[StillPair], *, title: str, name: str, key: str
+    page: GrowingPage,
+    methods: Sequence[Method],
+    pairs: Iterable[StillPair],
+    *,
+    title: str,
+    name: str,
+    key: str = "methods",
+    processes: int = 1,
 ) -> None:
     """Measure pairs of one resolution, and update the section called `name` and the record's `key` list."""
     title = f"Light against run time: {title}"
     page.doing(f"{title}: drawing")
     before, results = page.record.get(key, []), dict[str, MethodResult]()
-    for done, result in measure(methods, pairs, viewers=page.out):
-        page.doing(f"{title}: finished {done}")
+    total = len(methods) * (len(pairs) if isinstance(pairs, Sized) else len(PROCEDURAL))
+    for number, (done, result) in enumerate(measure(methods, pairs, viewers=page.out, processes=processes), start=1):
+        page.doing(f"{title}: finished {number} of {total}, {done}")
         page.record["yardsticks_ms"].append(yardstick_ms())
+        if not isinstance(result, MethodResult):
+            page.failed(done, result)
+            continue
         results[result.name] = result
         page.record[key] = before + [asdict(one) for one in results.values()]
         page.put(name, frontier_section(list(results.values()), title=title, name=name))
@@ -172,8 +194,9 @@ def _moving(page: GrowingPage, *, quick: bool) -> None:
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         done = pool.map(lambda run: apart(measure, *run), runs)
         for result in done:
-            page.doing(f"what a moving viewer sees: finished {result.motion} with effort {result.effort}")
             results.append(result)
+            count = f"{len(results)} of {len(runs)}"
+            page.doing(f"what a moving viewer sees: finished {count}, {result.motion} with effort {result.effort}")
             page.record["moving"] = [asdict(one) for one in results]
             page.put("moving", moving_section(results))
 

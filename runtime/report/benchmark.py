@@ -106,6 +106,8 @@ def measured(
         with PairPainter("demo", stack) as painter:
             pair = painter.pair("demo", eyes_at(distance_m=0.6, height_m=0.05), off_mm=())
         for done, result in measure(methods, [pair]):
+            if not isinstance(result, MethodResult):
+                raise result
             progress(f"{width}x{height}: finished {done}")
             yardsticks.append(yardstick_ms())
             entries.append(_entry(result))

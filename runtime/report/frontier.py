@@ -7,7 +7,7 @@ import math
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
 from multiprocessing import get_context
@@ -27,6 +27,7 @@ from runtime.report.pairs import StillPair
 from runtime.support.artifacts import write_text
 from runtime.support.picture_file import read_image
 from runtime.support.sections import read_table
+from runtime.support.threads import ahead
 
 if TYPE_CHECKING:
     from runtime.model.predictor import Predictor
@@ -165,20 +166,36 @@ class MethodResult:
 
 
 def measure(
-    methods: Sequence[Method], pairs: Iterable[StillPair], *, threads: int = 2, viewers: Path | None = None
-) -> Iterator[tuple[str, MethodResult]]:
+    methods: Sequence[Method],
+    pairs: Iterable[StillPair],
+    *,
+    threads: int = 2,
+    viewers: Path | None = None,
+    processes: int = 1,
+) -> Iterator[tuple[str, MethodResult | FatalError]]:
     """Yield the method, the pair and the result so far of each method on pairs of one resolution, pair by
-    pair. Viewer pages, if there is a folder for them, are written only for the first method. Raises FatalError if a
-    measurement failed or a measuring process died.
+    pair; or the error if a measurement failed or its process died. Viewer pages, if there is a folder for them, are
+    written only for the first method. `processes` measure at the same time.
     """
     results: dict[str, list[PairResult]] = {method.name: [] for method in methods}
-    for pair in pairs:
-        for method in methods:
-            is_stored = method.kind == "layers"
-            run = stored_run(method, pair) if is_stored else apart(run_method, method, replace(pair, off=()), threads)
-            viewer = viewers if method is methods[0] else None
-            results[method.name].append(pair_result(pair, run, viewer=viewer))
-            yield f"{method.name}, {pair.name}", _together(method, pair, run, results[method.name])
+
+    def measured(method: Method, pair: StillPair) -> tuple[MethodRun, PairResult]:
+        is_stored = method.kind == "layers"
+        run = stored_run(method, pair) if is_stored else apart(run_method, method, replace(pair, off=()), threads)
+        viewer = viewers if method is methods[0] else None
+        return run, pair_result(pair, run, viewer=viewer)
+
+    with ThreadPoolExecutor(processes) as pool:
+        begun = ((method, pair, pool.submit(measured, method, pair)) for pair in pairs for method in methods)
+        for method, pair, future in ahead(begun, processes):
+            what = f"{method.name}, {pair.name}"
+            try:
+                run, found = future.result()
+            except FatalError as error:
+                yield what, error
+                continue
+            results[method.name].append(found)
+            yield what, _together(method, pair, run, results[method.name])
 
 
 def apart(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
@@ -194,8 +211,8 @@ def apart(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
 def _called(function: Callable[..., T], args: Any, kwargs: Any) -> T:
     try:
         return function(*args, **kwargs)
-    except PhasestackError as error:  # some error classes cannot be pickled
-        raise FatalError(str(error)) from None
+    except (PhasestackError, MemoryError) as error:  # some error classes cannot be pickled
+        raise FatalError(str(error) or "not enough memory") from None
 
 
 def run_method(method: Method, pair: StillPair, threads: int) -> MethodRun:

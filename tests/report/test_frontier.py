@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from runtime.errors import FatalError, InputError
+from runtime.model.predictor import Predictor
 from runtime.optics.carried import expected_psnrs_db, intensities
 from runtime.optics.light import ONE_RAY
 from runtime.optics.quality import quality
@@ -101,3 +102,22 @@ def test_a_measurement_process_answers_refuses_or_is_reported_dead() -> None:
         apart(refuse)
     with pytest.raises(FatalError, match="die: the measuring process died"):
         apart(die)
+
+
+class Dying(Method):
+    def opened(self, stack: PanelStack, *, threads: int) -> Predictor:
+        die()
+        return super().opened(stack, threads=threads)
+
+
+def test_a_measurement_that_dies_ends_no_other_also_of_several_at_once(pair: StillPair) -> None:
+    """It ended the report."""
+    methods = [Dying("dies", "iterative", "sart", 1), Method("SART-1", "iterative", "sart", 1)]
+    pairs = [pair, replace(pair, name="again")]
+    (_, (_, one)), two = (list(measure(methods, pairs[:n], processes=n)) for n in (1, 2))
+    assert [what for what, _ in two] == ["dies, demo", "SART-1, demo", "dies, again", "SART-1, again"]
+    died, last = two[2][1], two[3][1]
+    assert isinstance(died, FatalError) and "process died" in str(died)
+    assert isinstance(one, MethodResult) and isinstance(last, MethodResult)
+    assert [each.pair for each in last.pairs] == ["demo", "again"]
+    assert last.pairs[0].quality == one.pairs[0].quality

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,10 +15,10 @@ from typer.testing import Result
 
 from model_export.export import export_model
 from runtime.commands.report import report
-from runtime.errors import InputError
+from runtime.errors import FatalError, InputError
 from runtime.evaluation.solved import PairQuality
 from runtime.model.predictor import model_path
-from runtime.report import sections
+from runtime.report import frontier, sections
 from runtime.report.assemble import GrowingPage, Own, whole_report
 from runtime.report.frontier import MethodResult, PairResult
 from runtime.report.moving import FULL, Moving, moving_run
@@ -122,6 +123,27 @@ def test_every_case_and_layer_is_checked_before_anything_is_measured(tmp_path: P
         path.write_bytes(before)
     assert "requires --pairs" in str(command("--only-pairs", "--out", str(tmp_path / "out")).exception)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_failed_measurement_is_told_and_the_report_is_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def fails(call: Callable[..., Any], *given: Any) -> Any:
+        if given[0].name == "fast":
+            raise FatalError("run_method: the measuring process died unexpectedly")
+        return call(*given)
+
+    monkeypatch.setattr(frontier, "apart", fails)
+    monkeypatch.setattr(frontier, "ENOUGH_S", 0.0)
+    (tmp_path / "cases").mkdir()
+    case_folder(tmp_path / "cases", off=None)
+    done = command("--pairs", str(tmp_path / "cases"), "--only-pairs", "--quick", "--out", str(tmp_path / "out"))
+    assert isinstance(done.exception, FatalError) and "1 measurement failed" in str(done.exception)
+    record = json.loads((tmp_path / "out" / "report.json").read_text())
+    line = "fast, case: run_method: the measuring process died unexpectedly"
+    assert record["complete"] is True and record["failed"] == [line]
+    assert line in done.stderr
+    assert len(record["methods"]) == 5 and line in (tmp_path / "out" / "index.html").read_text()
 
 
 @pytest.mark.slow
