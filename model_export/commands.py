@@ -90,7 +90,8 @@ def train(
     }
     training = validated(Training, settings, source="train")
     result = run_training(out, training, device=device, resume=resume)
-    typer.echo(shown(result, as_json=as_json))
+    if result:  # other processes of torchrun have none
+        typer.echo(shown(result, as_json=as_json))
 
 
 def options_of(texts: list[str] | None) -> dict[str, Any]:

@@ -28,6 +28,7 @@ from model_export.checkpoint import fill, load_checkpoint, save_checkpoint
 from model_export.light import LEAST_ERROR, Views, improved, light, light_db
 from model_export.modules import COLOURS, PANELS, Form, Network, blamed, make_network, probe
 from model_export.pairs import TrainingPairs, folder_pairs
+from model_export.ranks import Ranks, joined
 from runtime.config import Section, load_stack
 from runtime.errors import InputError
 from runtime.report.page import drawing, png
@@ -64,10 +65,17 @@ class Training(Section):
 
 def run_training(out: Path, training: Training, *, device: Device = "auto", resume: bool = False) -> dict[str, Any]:
     """Train a picture network, and write `checkpoint.pth`, `curve.csv` and `curve.png` to a folder at
-    intervals. `resume` continues from its checkpoint. Raises InputError if the network, the data or the checkpoint is
-    invalid, or the loss is not finite.
+    intervals. `resume` continues from its checkpoint. The processes of `torchrun` share each batch; all but the first
+    write and return nothing. Raises InputError if the network, the data or the checkpoint is invalid, or the loss is
+    not finite.
     """
-    place, start = _placed(device), time.monotonic()
+    place = _placed(device)
+    with joined(place, training.batch) as ranks:
+        return _trained(out, training, ranks, resume=resume)
+
+
+def _trained(out: Path, training: Training, ranks: Ranks, *, resume: bool) -> dict[str, Any]:
+    place, start, is_first = ranks.place, time.monotonic(), ranks.rank == 0
     network = make_network(training.arch, training.options, seed=training.seed)
     probe(network, width_px=training.width_px, height_px=training.height_px)
     pairs, held_out = _data(training, network.form)
@@ -80,9 +88,15 @@ def run_training(out: Path, training: Training, *, device: Device = "auto", resu
     if place.type == "cpu" and training.width_px * training.height_px * training.batch <= SMALL_PX:
         torch.set_num_threads(1)
     unseen = list(DataLoader(held_out, 1, sampler=range(len(held_out))))
-    curve = curve or [[0, math.nan, _held_out_db(network, unseen, place)]]
+
+    def validated_db() -> float:
+        return _held_out_db(network, unseen, place) if is_first else math.nan
+
+    curve = curve or [[0, math.nan, validated_db()]]
 
     def save(number: int) -> None:
+        if not is_first:
+            return
         state: dict[str, Any] = {"model": net.state_dict(), "optimizer": optimizer.state_dict()}
         state |= {
             "rate": rate.state_dict(),
@@ -94,12 +108,13 @@ def run_training(out: Path, training: Training, *, device: Device = "auto", resu
         save_checkpoint(out / "checkpoint.pth", state)
 
     with progress_bar(f"training {training.arch}") as progress, _signals() as stop:
-        for number, batch in enumerate(_loader(pairs, training, done, training.iterations), start=done + 1):
-            torch.manual_seed(training.seed * HELD_OUT_SEED + number)
+        for number, batch in enumerate(_loader(pairs, training, ranks, done), start=done + 1):
+            torch.manual_seed(training.seed * HELD_OUT_SEED + number + (ranks.rank << 40))
             with blamed(training.arch, f"iteration {number}"):
                 loss = _loss(network, _on(batch, place))
                 optimizer.zero_grad(set_to_none=True)
                 loss.backward()  # type: ignore[no-untyped-call]
+            ranks.mean([loss, *(p.grad for p in net.parameters() if p.grad is not None)])
             if not torch.isfinite(loss):
                 raise InputError(
                     training.arch, f"iteration {number}", "the measured light is not finite; lower the learning rate"
@@ -108,21 +123,25 @@ def run_training(out: Path, training: Training, *, device: Device = "auto", resu
             optimizer.step()
             rate.step()
             lights.append(-loss.item())
-            progress(number, training.iterations)
-            if stop:
+            if is_first:
+                progress(number, training.iterations)
+            if ranks.any(bool(stop)):
                 save(number)
                 line = f"train: stopped after iteration {number} of {training.iterations}; pass --resume to continue"
                 print(line, file=sys.stderr)
-                raise SystemExit(128 + stop[0])
+                raise SystemExit(128 + (stop or [signal.SIGTERM])[0])
             if number % training.validate_every and number != training.iterations:
                 if number == FIRST_SAVED:
                     save(number)
                 continue
-            curve.append([number, sum(lights) / len(lights), _held_out_db(network, unseen, place)])
+            curve.append([number, sum(lights) / len(lights), validated_db()])
             lights.clear()
             save(number)
-            write_text(out / "curve.csv", "\n".join([",".join(COLUMNS), *map(_row, curve)]) + "\n")
-            write_bytes(out / "curve.png", _drawn(curve, training.arch))
+            if is_first:
+                write_text(out / "curve.csv", "\n".join([",".join(COLUMNS), *map(_row, curve)]) + "\n")
+                write_bytes(out / "curve.png", _drawn(curve, training.arch))
+    if not is_first:
+        return {}
     return {
         "arch": training.arch,
         "iterations": curve[-1][0],
@@ -217,17 +236,20 @@ def _data(training: Training, form: Form) -> tuple[TrainingPairs, TrainingPairs]
     return learned, replace(learned, seed=HELD_OUT_SEED, count=len(held) or HELD_OUT, folder=held)
 
 
-def _loader(pairs: TrainingPairs, training: Training, first: int, last: int) -> DataLoader[Batch]:
-    """Load the batches, each by its number alone, for the iterations after `first`, up to and including `last`."""
+def _loader(pairs: TrainingPairs, training: Training, ranks: Ranks, done: int) -> DataLoader[Batch]:
+    """Load this process's share of the batches, each by its number alone, for the iterations after `done`."""
     size = training.batch
+    numbers = range(done * size + ranks.rank, training.iterations * size, ranks.count)
     workers = min(8, len(os.sched_getaffinity(0)) - 1) if torch.cuda.is_available() else 0
-    return DataLoader(pairs, size, sampler=range(first * size, last * size), num_workers=workers)
+    return DataLoader(pairs, size // ranks.count, sampler=numbers, num_workers=workers)
 
 
 def _placed(device: Device) -> torch.device:
     if device == "cuda" and not torch.cuda.is_available():
         raise InputError("train", "--device", "cuda is not available because torch finds no GPU")
-    return torch.device("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
+    if device == "cpu" or not torch.cuda.is_available():
+        return torch.device("cpu")
+    return torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
 
 
 def _on(batch: Batch, device: torch.device) -> Batch:

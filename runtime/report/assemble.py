@@ -106,7 +106,7 @@ def whole_report(
     Case files in `pairs`, and models, are checked before the first measurement; `own` says what else is done with them,
     and `models` are measured in addition to the shipped ones. `quick` draws built-in scenes with a quarter of the
     pixels, omits the slowest reference and shortens motions. Raises InputError for a case file or a model, or if
-    results cannot be written. A measurement that fails is listed in the record's `failed`, and the others go on.
+    results cannot be written. The record's `failed` lists measurements that failed.
     """
     cases = read_pairs(pairs) if pairs is not None else []
     stack = StackGeometry().stack()

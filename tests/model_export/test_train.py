@@ -133,6 +133,27 @@ def test_training_raises_the_light_that_eyes_get_and_leaves_its_files(tmp_path: 
     assert _held_out_db(after, [batch], torch.device("cpu")) > _held_out_db(before, [batch], torch.device("cpu")) + 0.5
 
 
+def test_two_processes_share_a_batch_and_learn_what_one_does(tmp_path: Path) -> None:
+    command = ["train", "--arch", SHORT["arch"], "--option", "width=8", "--option", "levels=1", "--iterations", "6"]
+    command += ["--width", "96", "--height", "64", "--validate-every", "3", "--learning-rate", "1e-2", "--json"]
+    two = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "phasestack"]
+    environment = os.environ | {"PYTHONPATH": f"{ROOT / 'examples'}{os.pathsep}{ROOT}"}
+
+    def trained(start: list[str], out: str, batch: str) -> subprocess.CompletedProcess[str]:
+        arguments = [*start, *command, "--batch", batch, "--out", str(tmp_path / out)]
+        return subprocess.run(arguments, env=environment, capture_output=True, text=True, timeout=300, check=False)
+
+    one, shared = trained([sys.executable, "-m", "phasestack"], "one", "4"), trained(two, "two", "4")
+    assert one.returncode == shared.returncode == 0, one.stderr + shared.stderr
+    assert json.loads(shared.stdout)["held_out_db"] == pytest.approx(json.loads(one.stdout)["held_out_db"], abs=0.01)
+    tables = [load_checkpoint(tmp_path / out / "checkpoint.pth") for out in ("one", "two")]
+    assert tables[0]["curve"][1:] == [pytest.approx(row, rel=1e-3) for row in tables[1]["curve"][1:]]
+    for name, weights in tables[0]["model"].items():
+        torch.testing.assert_close(tables[1]["model"][name], weights, rtol=1e-3, atol=1e-4)
+    odd = trained(two, "odd", "3")
+    assert odd.returncode != 0 and "--batch: must be a multiple of the 2 processes, not 3" in odd.stderr
+
+
 @pytest.mark.parametrize(("sent", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 def test_a_training_told_to_stop_leaves_its_last_iteration(tmp_path: Path, sent: signal.Signals, code: int) -> None:
     """Long before the first validation; --resume then ends where one that was never stopped does."""
