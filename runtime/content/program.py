@@ -15,7 +15,10 @@ from runtime.config import Section, validated
 from runtime.content.base import ContentInfo, ContentSource, View
 from runtime.content.camera import clip_from_stack
 from runtime.content.placing import SceneFile
-from runtime.content.program_server import SIDES, AskedViews, ProgramPicture, ProgramServer, acquire, release
+from runtime.content.program_link import Server
+from runtime.content.program_pictures import SIDES, AskedViews, ProgramPicture
+from runtime.content.program_serving import acquire, release
+from runtime.errors import ContentFailure
 from runtime.records import F32, U8
 
 NEAR_M, FAR_M = 0.05, 100.0
@@ -58,7 +61,7 @@ def camera_of(view: View) -> dict[str, Any]:
 class ProgramSource(ContentSource):
     """Source that shows pictures drawn by a connected program for the requested eye positions."""
 
-    def __init__(self, server: ProgramServer, *, display_m: tuple[float, float], background: Any) -> None:
+    def __init__(self, server: Server, *, display_m: tuple[float, float], background: Any) -> None:
         """Create a source that gives the server back when it is closed."""
         self._server, self._display_m = server, display_m
         self._shown: dict[int, ProgramPicture] = {}  # latest pictures, keyed by side
@@ -84,7 +87,11 @@ class ProgramSource(ContentSource):
         if self._expected is None or not any(_same(view, one) for one in self._expected[1]):
             self.expect([view], time_ns=time_ns)
         assert self._expected is not None
-        picture = self._shown[view.side] = self._server.drawn(self._expected[0]).pictures[view.side]
+        try:
+            picture = self._shown[view.side] = self._server.drawn(self._expected[0]).pictures[view.side]
+        except ContentFailure:
+            self._expected = None  # ask again
+            raise
         if picture.pixels.shape[:2] == (view.height_px, view.width_px):
             return np.ascontiguousarray(picture.pixels)
         return np.asarray(cv2.resize(picture.pixels, (view.width_px, view.height_px)), np.uint8)

@@ -1,40 +1,46 @@
 """Server for programs that draw: it passes on requests and keeps the newest pictures.
 
 It runs an event loop on a separate thread. No caller waits for a program: `ask` only leaves a request, and a
-program that reads slowly loses only its own messages. docs/programs.md describes the protocol.
+program that reads slowly loses only its own messages. docs/programs.md describes the protocol. In a run on the real
+clock, it is part of a process of its own (`program_link`).
 """
 
 from __future__ import annotations
 
 import asyncio
 import hmac
-import io
 import json
 import logging
 import mmap
 import os
-import secrets
 import socket as sockets
 import struct
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-import cv2
 import numpy as np
-from PIL import Image
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 
 from runtime.clock import NS_PER_S
+from runtime.content.program_pictures import (
+    ANSWERED_S,
+    IN_FLIGHT_MAX,
+    SIDES,
+    AskedViews,
+    DrawnPictures,
+    PictureForm,
+    ProgramPicture,
+    SharedPlace,
+)
 from runtime.errors import ContentFailure, InputError, one_line
-from runtime.records import F32, U8, U16
 from runtime.support.background import begin
 from runtime.support.channel import shared_memory
 from runtime.support.untrusted_input import parsed_json
@@ -44,16 +50,13 @@ library_log = logging.getLogger("phasestack.websockets")  # the library describe
 library_log.setLevel(logging.CRITICAL)
 
 HOST = "127.0.0.1"
-ANSWERED_S = 0.4  # time limit for all of a frame's pictures
 GIVEN_UP_S = 2.0  # an unanswered frame is abandoned after this time
-IN_FLIGHT_MAX = 2  # largest number of frames requested but not yet answered
 HELLO_S = 5.0  # time limit for the handshake, and for a program's greeting
 CLOSED_WITHIN_S = 1.0  # time limit for a program to close its connection, after it was told why
 HALF_OPEN_MAX = 16  # largest number of connections without a handshake; the oldest is closed
 CONNECTIONS_MAX = 32  # largest number of connected programs
 QUEUED_MAX = 4  # largest number of messages that the library holds for each connection
 HEAD = struct.Struct("<II")  # an answer's header: frame number and side (0 left, 1 right)
-SIDES = ("left", "right")
 SCALE_MIN = 0.1  # smallest pictures that a program can ask to draw, as a fraction of the display's width and height
 DEPTHS: dict[str, np.dtype[Any]] = {
     "uint16": np.dtype("<u2"),
@@ -63,102 +66,6 @@ ENCODINGS = ("raw", "jpeg")
 SLOTS = 4  # frames in shared memory: two in flight, the newest, and the one that the solver still reads
 MESSAGE_MAX_BYTES = 8 * 7680 * 4320 + HEAD.size
 WRONG_DATA, LEAVING, TOO_BIG = 1007, 1001, 1009  # close codes of RFC 6455
-
-
-@dataclass(frozen=True, slots=True)
-class AskedViews:
-    """Views that programs are asked to draw, in the form sent to them."""
-
-    time_ns: int  # on the run's clock
-    width_px: int
-    height_px: int
-    eyes: tuple[dict[str, Any], ...]  # see `program.camera_of`; `eye` is left or right
-    display_m: tuple[float, float]  # width and height of the panels
-
-    @property
-    def sides(self) -> tuple[int, ...]:
-        return tuple(SIDES.index(eye["eye"]) for eye in self.eyes)
-
-
-@dataclass(frozen=True, slots=True)
-class ProgramPicture:
-    """An eye's picture, with the top row first. It may be smaller than requested."""
-
-    pixels: U8  # RGBA (h, w, 4)
-    depth: F32 | U16 | None  # (h, w) values of the depth buffer, or None if the program does not send it
-
-
-@dataclass(frozen=True, slots=True)
-class DrawnPictures:
-    """A frame's complete set of pictures."""
-
-    number: int  # of the frame, as returned by `ask`
-    pictures: Mapping[int, ProgramPicture]  # keyed by side
-
-
-@dataclass(frozen=True, slots=True)
-class _Form:
-    """Size and parts of a program's pictures."""
-
-    width_px: int
-    height_px: int
-    depth: np.dtype[Any] | None
-    bottom_up: bool
-    encoding: str = "raw"
-
-    @property
-    def depth_bytes(self) -> int:
-        return 0 if self.depth is None else self.depth.itemsize * self.width_px * self.height_px
-
-    @property
-    def pixels_bytes(self) -> int:
-        return 4 * self.width_px * self.height_px
-
-    @property
-    def bytes(self) -> int:
-        return self.pixels_bytes + self.depth_bytes
-
-    def received(self, data: memoryview) -> ProgramPicture:
-        """Return the picture in a message. Raises ValueError if it has the wrong size or encoding."""
-        if self.encoding == "raw":
-            return self.picture(data)
-        end = max(len(data) - self.depth_bytes, 0)
-        pixels = decoded_jpeg(bytes(data[:end]), self.width_px, self.height_px)
-        return ProgramPicture(pixels[:: self._order], self._depth_in(data[end:]))
-
-    def picture(self, data: memoryview) -> ProgramPicture:
-        """Return the raw picture in a message or in shared memory, without copying it. Raises ValueError if
-        the data has the wrong size.
-        """
-        if len(data) != self.bytes:
-            parts = "RGBA pixels" if self.depth is None else f"RGBA pixels and {self.depth.name} depths"
-            raise ValueError(f"the answer has {len(data)} bytes, which is not {self.width_px}x{self.height_px} {parts}")
-        pixels = np.frombuffer(data[: self.pixels_bytes], np.uint8).reshape(self.height_px, self.width_px, 4)
-        return ProgramPicture(pixels[:: self._order], self._depth_in(data[self.pixels_bytes :]))
-
-    @property
-    def _order(self) -> int:
-        return -1 if self.bottom_up else 1
-
-    def _depth_in(self, data: memoryview) -> F32 | U16 | None:
-        if self.depth is None:
-            return None
-        return np.frombuffer(data, self.depth).reshape(self.height_px, self.width_px)[:: self._order]
-
-
-def decoded_jpeg(data: bytes, width_px: int, height_px: int) -> U8:
-    """Return the RGBA pixels (h, w, 4) of a JPEG. Raises ValueError if it is invalid or has another size."""
-    try:
-        with Image.open(io.BytesIO(data), formats=["JPEG"]) as header:
-            size = header.size
-    except (OSError, ValueError):
-        raise ValueError("the answer is not a JPEG picture") from None
-    if size != (width_px, height_px):
-        raise ValueError(f"the answer is a picture of {size[0]}x{size[1]} pixels, not {width_px}x{height_px}")
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    if pixels is None:
-        raise ValueError("the answer is not a JPEG picture")
-    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGBA), np.uint8)
 
 
 class _Memory:
@@ -185,9 +92,9 @@ class _Frame:
 
     asked: AskedViews
     asked_s: float  # request time on the monotonic clock
-    form: _Form
+    form: PictureForm
     pictures: dict[int, ProgramPicture] = field(default_factory=dict)  # keyed by side
-    places: dict[int, memoryview] = field(default_factory=dict)  # the pictures' places in shared memory, keyed by side
+    places: dict[int, tuple[memoryview, SharedPlace]] = field(default_factory=dict)  # in shared memory, keyed by side
 
 
 class _Connection(ServerConnection):
@@ -243,10 +150,10 @@ class _Client:
         self._messages: deque[str] = deque(maxlen=1 if self.listens else 2 * IN_FLIGHT_MAX)
         self._has_messages = asyncio.Event()
 
-    def form(self, asked: AskedViews) -> _Form:
+    def form(self, asked: AskedViews) -> PictureForm:
         """Return the size and parts of the pictures for a request."""
         width_px, height_px = (max(1, round(size * self._scale)) for size in (asked.width_px, asked.height_px))
-        return _Form(width_px, height_px, self._depth, self.bottom_up, self._encoding)
+        return PictureForm(width_px, height_px, self._depth, self.bottom_up, self._encoding)
 
     def request(self, number: int, frame: _Frame) -> None:
         """Leave a request for the program and, if it uses shared memory, choose the places of the pictures."""
@@ -257,7 +164,8 @@ class _Client:
             self._frames_shared += 1
             for n, (side, eye) in enumerate(zip(asked.sides, asked.eyes)):
                 at = (2 * (self._frames_shared % SLOTS) + side) * size_bytes
-                frame.places[side] = self._memory.data[at : at + size_bytes]
+                place = SharedPlace(self._memory.path, self._memory.bytes, at, frame.form)
+                frame.places[side] = self._memory.data[at : at + size_bytes], place
                 eyes[n] = eye | {"at": at}
         self.post(_message(number, asked, frame.form.width_px, frame.form.height_px, eyes))
 
@@ -483,7 +391,7 @@ class ProgramServer:
                 return  # the frame was abandoned
         data = memoryview(message)[HEAD.size :]
         in_memory = not data and side in frame.places
-        frame.pictures[side] = frame.form.picture(frame.places[side]) if in_memory else frame.form.received(data)
+        frame.pictures[side] = frame.form.picture(*frame.places[side]) if in_memory else frame.form.received(data)
         if len(frame.pictures) == len(frame.asked.eyes):
             self._complete(number, frame)
 
@@ -522,58 +430,3 @@ def _message(number: int, asked: AskedViews, width_px: int, height_px: int, eyes
 def _shortened(why: str) -> str:
     """Return a reason that fits in a close message, which holds 123 bytes."""
     return why.encode("ascii", "replace").decode()[:120]
-
-
-_lock = threading.Lock()
-_servers: dict[int, tuple[ProgramServer, int]] = {}  # open servers and their numbers of users, keyed by the port asked
-_addresses: dict[int, tuple[int, str]] = {}  # port and token of the last server, keyed by the port asked
-
-
-def acquire(port: int) -> ProgramServer:
-    """Return the server for a TCP port, 0 for any, which the caller must `release`. Raises InputError if
-    it cannot be opened. The address, with the token, stays the same for the life of the process if the port is still
-    free, so that programs find the server again after a scene or the solver has been restarted.
-    """
-    with _lock:
-        server, users = _servers.get(port, (None, 0))
-        if server is None:
-            server = _opened(port)
-        _servers[port] = server, users + 1
-        return server
-
-
-def addresses() -> dict[int, tuple[int, str]]:
-    """Return the port and token of each server opened so far, keyed by the port asked for."""
-    with _lock:
-        return dict(_addresses)
-
-
-def reopen_at(last: Mapping[int, tuple[int, str]]) -> None:
-    """Use the ports and tokens of servers in a process that has ended, as returned by its `addresses`."""
-    with _lock:
-        _addresses.update(last)
-
-
-def _opened(port: int) -> ProgramServer:
-    last_port, token = _addresses.get(port, (port, secrets.token_urlsafe(24)))
-    for attempt in (last_port, port):
-        try:
-            server = ProgramServer(attempt, token)
-        except OSError as error:
-            problem = f"cannot listen on port {attempt}: {error.strerror}"
-            continue
-        _addresses[port] = server.port, token
-        return server
-    raise InputError("content.options", "port", problem)
-
-
-def release(server: ProgramServer) -> None:
-    """Give back a server. It is closed when its last user has given it back."""
-    with _lock:
-        for port, (one, users) in tuple(_servers.items()):
-            if one is server:
-                if users > 1:
-                    _servers[port] = server, users - 1
-                    return
-                del _servers[port]
-    server.close()

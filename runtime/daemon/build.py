@@ -18,6 +18,7 @@ from runtime.clock import NS_PER_MS, NS_PER_S, Clock, MonotonicClock, SimulatedC
 from runtime.config import Settings
 from runtime.daemon import solver_worker
 from runtime.daemon.pose import PoseSender
+from runtime.daemon.programs import Programs
 from runtime.daemon.solver_parts import RunningSolver, SolverSetup
 from runtime.errors import InputError, PanelLost, Stopped
 from runtime.eyes.calibration import load_calibration
@@ -81,7 +82,11 @@ class Run:
 
     presenter: Presenter
     observer: RunObserver
-    simulated: bool
+    programs: Programs | None  # None on a simulated clock, where the solver serves programs itself
+
+    @property
+    def simulated(self) -> bool:
+        return self.programs is None
 
     def plan_items(self, facts: Facts, live: Live) -> list[dict[str, Any]]:
         """Return the savings in use as dictionaries. Any time or cost that was not measured is None."""
@@ -92,7 +97,8 @@ class Run:
     def processes(self) -> list[dict[str, Any]]:
         """Return what each of the run's processes uses, read now."""
         own = {"role": "presenter", "restarts": 0, **usage(os.getpid())}
-        return [own, *self.presenter.solver.status(), *self.presenter.samples.status()]
+        programs = [] if self.programs is None else self.programs.status()
+        return [own, *self.presenter.solver.status(), *self.presenter.samples.status(), *programs]
 
     def summary(self) -> dict[str, Any]:
         """Return the contents of summary.json (docs/contracts.md)."""
@@ -174,8 +180,14 @@ def build_run(
     solver: SolverHost
     if not simulated:
         lost: list[PanelSink] = []
+        programs = Programs()
+        cleanup.callback(programs.close)
         solver = process = start_solver(
-            settings, stack, clock, contexts_lost=lambda: sum(sink.contexts_lost for sink in lost)
+            settings,
+            stack,
+            clock,
+            programs=programs,
+            contexts_lost=lambda: sum(sink.contexts_lost for sink in lost),
         )
         cleanup.callback(solver.close)
     host.starting("creating the OpenGL context")
@@ -234,7 +246,7 @@ def build_run(
         host.recorder.watches(presenter, in_stack_frame=in_stack_frame)
     if not simulated:
         cleanup.enter_context(before_all_others())  # affects only this thread, because all others have already started
-    run = Run(presenter, observer, simulated)
+    run = Run(presenter, observer, None if simulated else programs)
     host.watches(run)
     return run
 
@@ -257,13 +269,13 @@ def start_sensor(settings: Settings, clock: Clock, link: BrowserLink | None = No
 
 
 def start_solver(
-    settings: Settings, stack: PanelStack, clock: Clock, *, contexts_lost: Callable[[], int]
+    settings: Settings, stack: PanelStack, clock: Clock, *, programs: Programs, contexts_lost: Callable[[], int]
 ) -> SolverProcess:
     """Start a solver's process, which is replaced when `contexts_lost` changes."""
 
     def setup(known: Known) -> SolverSetup:
         if known.facts is None:
-            return SolverSetup(settings, stack, step_s=STEP_S)
+            return SolverSetup(settings, stack, programs=programs.descriptor, step_s=STEP_S)
         facts = known.facts
         device: Wanted = "gl" if facts.backend == "gl" else "cpu"
         return SolverSetup(
@@ -272,13 +284,14 @@ def start_solver(
             device=device,
             version=facts.version,
             scene=facts.scene,
-            program_addresses=facts.program_addresses,
+            programs=programs.descriptor,
             first_number=known.next_number,
             costs=known.first,
             step_s=STEP_S,
         )
 
-    return SolverProcess(solver_worker.role(SOLVER_MEMORY_BYTES), stack, setup, clock, contexts_lost=contexts_lost)
+    role = solver_worker.role(SOLVER_MEMORY_BYTES)
+    return SolverProcess(role, stack, setup, clock, contexts_lost=contexts_lost, files=(programs.descriptor,))
 
 
 def _open_panels(settings: Settings, stack: PanelStack, clock: Clock, context: Any, host: Host) -> PanelSink:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import logging
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
-from importlib import import_module
 from typing import Any
 
 from runtime.config import Settings, changed
@@ -61,7 +59,7 @@ class SolverSetup:
     version: int = 0  # of the solver's state
     scene: int = 1  # number of the scene
     costs: Mapping[int, Mapping[str, float]] | None = None  # costs measured by an earlier solver; None: measure them
-    program_addresses: Mapping[int, tuple[int, str]] = field(default_factory=dict)  # of an earlier solver
+    programs: int | None = None  # descriptor of the channel to `daemon.programs`; None: serve programs in this process
     step_s: float = 10.0  # time limit for a step of a solver in its own process
 
 
@@ -71,8 +69,6 @@ class RunningSolver:
     def __init__(self, setup: SolverSetup, *, context: Any = None, slots: LayerSlots | None = None) -> None:
         """Load the content and the model, for a new or a shared GL context. Raises FatalError, with all closed."""
         settings, stack = setup.settings, setup.stack
-        if setup.program_addresses:
-            import_module("runtime.content.program_server").reopen_at(setup.program_addresses)
         self._slots, self._owns_context = slots, context is None
         with ExitStack() as undo:
             opener = prepare_content(settings.content, stack)
@@ -184,7 +180,6 @@ class RunningSolver:
             predictor.refined_steps,
             predictor.backend,
             self.backend.why,
-            _program_addresses(),
         )
 
     def live(self, time_ns: int) -> Live:
@@ -231,8 +226,3 @@ class RunningSolver:
                 release()
             except Exception as error:  # for example because the context was lost
                 log.warning("error while closing the solver: %s", error)
-
-
-def _program_addresses() -> Mapping[int, tuple[int, str]]:
-    server: Any = sys.modules.get("runtime.content.program_server")  # imported only for the scene `program`
-    return {} if server is None else server.addresses()

@@ -10,12 +10,14 @@ import cv2
 import numpy as np
 
 from runtime.clock import NS_PER_MS
+from runtime.content import program_link
 from runtime.daemon.solver_parts import RunningSolver, SolverSetup
 from runtime.frame.effort import REST, CostBook, stages_for
 from runtime.frame.messages import Busy, Idle, Live, Order, Slot, SolverUpdate, Stepped
 from runtime.frame.solver_host import first_request
 from runtime.model.buffers import LayerSlots
 from runtime.records import SOLVING_STAGES, Solution, SolveRequest
+from runtime.support.channel import Channel
 from runtime.support.memory import keep_freed_memory
 from runtime.support.process import Parent, Role
 from runtime.support.untrusted_input import LIMITS
@@ -38,6 +40,8 @@ def main(parent: Parent, memory: int, setup: SolverSetup) -> None:
     cv2.setNumThreads(setup.settings.model.threads or -1)
     slots = LayerSlots(memory, setup.stack)
     os.close(memory)
+    if setup.programs is not None:
+        program_link.use(Channel.of(setup.programs))
     _Serving(parent, RunningSolver(setup, slots=slots), slots, step_s=setup.step_s).run()
 
 

@@ -81,7 +81,6 @@ class Facts:
     refined_steps: int  # most updates of a solution that is continued
     backend: str
     backend_why: str
-    program_addresses: Mapping[int, tuple[int, str]] = field(default_factory=dict)  # for the next solver
 
 
 @dataclass(frozen=True, slots=True)

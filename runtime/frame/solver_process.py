@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -62,9 +62,11 @@ class SolverProcess(SolverHost):
         clock: Clock,
         *,
         contexts_lost: Callable[[], int] = lambda: 0,
+        files: Sequence[int] = (),
     ) -> None:
-        """Start a solver, whose `setup` is read on another thread. The clock must be the machine's. The solver is
-        replaced whenever the number of GL contexts lost by the panels changes.
+        """Start a solver, whose `setup` is read on another thread, and which inherits file descriptors under the same
+        numbers. The clock must be the machine's. The solver is replaced whenever the number of GL contexts lost by the
+        panels changes.
         """
         super().__init__()
         self._clock, self._setup, self._contexts_lost = clock, setup, contexts_lost
@@ -82,7 +84,7 @@ class SolverProcess(SolverHost):
         self._is_late = False
         self._is_new = False  # True until the first solution after a change of the scene or model
         self._lost_before = 0
-        self._worker = Worker(role, lambda: (self._memory, self._setup(self._known)), files=(self._memory,))
+        self._worker = Worker(role, lambda: (self._memory, self._setup(self._known)), files=(self._memory, *files))
 
     def wait_ready(self, go_on: Callable[[], bool] = lambda: True) -> None:
         """Wait until the first solver is ready or `go_on` returns False. Raises the error that prevented it."""

@@ -25,7 +25,7 @@ class ChannelClosed(Exception):
 
 class Channel:
     """One end of a two-way channel of picklable values, which arrive whole, in order, or not at all. Both
-    processes are trusted, because a message is unpickled. Each end may be used by only one thread at a time.
+    processes are trusted, because a message is unpickled. Only one thread at a time may receive at each end.
     """
 
     def __init__(self, end: socket.socket) -> None:

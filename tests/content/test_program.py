@@ -32,13 +32,16 @@ from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
 from runtime.config import ContentSettings, StackGeometry
-from runtime.content import program_server
+from runtime.content import program_link, program_server
 from runtime.content.placed import Placing, placed_source
 from runtime.content.program import camera_of
+from runtime.content.program_link import ProgramLink
 from runtime.content.registry import open_content
+from runtime.daemon.programs import Programs
 from runtime.errors import ContentFailure, InputError
 from runtime.optics.views import image_from_stack
 from runtime.plan.drawing import raster_views, retina_pictures, retina_view
+from runtime.support.channel import Channel
 from tests.browser.test_viewer import needs_chromium
 from tests.waiting import eventually
 
@@ -52,6 +55,22 @@ def source() -> Iterator[Any]:
     made = open_content(ContentSettings(scene="program"), STACK, None)
     yield made
     made.close()
+
+
+@pytest.fixture(params=["here", "elsewhere"])
+def either(request: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """A source whose server is in this process, or in one of its own as in a run on the real clock."""
+    if request.param == "here":
+        yield request.getfixturevalue("source")
+        return
+    programs = Programs()
+    channel = Channel.of(os.dup(programs.descriptor))
+    monkeypatch.setattr(program_link, "_link", ProgramLink(channel))
+    made = open_content(ContentSettings(scene="program"), STACK, None)
+    yield made
+    made.close()
+    channel.close()
+    programs.close()
 
 
 def picture_of(asked: dict, eye: dict) -> bytes:
@@ -103,14 +122,14 @@ def drawn(source: Any, time_ns: int = 0) -> tuple[np.ndarray, np.ndarray]:
     return left, right
 
 
-def test_both_eyes_are_asked_for_at_once_and_get_their_own_picture(source: Any) -> None:
-    program = Program(source)
-    left, right = drawn(source, time_ns=1_500_000_000)
+def test_both_eyes_are_asked_for_at_once_and_get_their_own_picture(either: Any) -> None:
+    program = Program(either)
+    left, right = drawn(either, time_ns=1_500_000_000)
     (asked,) = program.asked
     assert (asked["width"], asked["height"], asked["time_s"]) == (64, 36, 1.5)
     assert [eye["eye"] for eye in asked["eyes"]] == ["left", "right"]
     assert (left[..., 0] == 200).all() and (right[..., 0] == 100).all() and (left[:, 5, 1] == np.arange(36)).all()
-    assert 0 < source.program["frame_ms"] < 400 and source.problem == ""
+    assert 0 < either.program["frame_ms"] < 400 and either.problem == ""
     program.end()
 
 
@@ -140,22 +159,22 @@ def test_matrices_put_points_where_the_view_has_them(source: Any, placed: bool) 
         assert (np.abs(clip[2] / clip[3]) < 1).all()
 
 
-def test_without_a_program_the_state_says_where_one_may_connect(source: Any) -> None:
+def test_without_a_program_the_state_says_where_one_may_connect(either: Any) -> None:
     with pytest.raises(ContentFailure, match="no program is connected; `phasestack status` shows the address"):
-        drawn(source)
+        drawn(either)
 
 
-def test_a_silent_program_is_late_and_gets_at_most_two_requests(source: Any) -> None:
-    program = Program(source, lambda asked, eye: None)
+def test_a_silent_program_is_late_and_gets_at_most_two_requests(either: Any) -> None:
+    program = Program(either, lambda asked, eye: None)
     for _ in range(2):
         with pytest.raises(ContentFailure, match="not answer within 400 ms"):
-            drawn(source)
+            drawn(either)
     with pytest.raises(ContentFailure, match="late: 2 requests"):
-        drawn(source)
+        drawn(either)
     assert len(program.asked) == 2
     time.sleep(2.1)
     with pytest.raises(ContentFailure, match="not answer within"):
-        drawn(source)
+        drawn(either)
     assert len(program.asked) == 3
     program.end()
 
@@ -177,15 +196,15 @@ def _draws(source: Any) -> bool:
         return False
 
 
-def test_a_program_with_the_wrong_size_is_told_why_and_may_return(source: Any) -> None:
-    program = Program(source, lambda asked, eye: b"x" * 100)
+def test_a_program_with_the_wrong_size_is_told_why_and_may_return(either: Any) -> None:
+    program = Program(either, lambda asked, eye: b"x" * 100)
     with pytest.raises(ContentFailure, match="100 bytes, which is not 64x36"):
-        drawn(source)
-    assert program.ended.wait(10) and "100 bytes" in source.problem
-    again = Program(source)
-    assert drawn(source)[0].shape == (36, 64, 3) and source.problem == ""
+        drawn(either)
+    assert program.ended.wait(10) and "100 bytes" in either.problem
+    again = Program(either)
+    assert drawn(either)[0].shape == (36, 64, 3) and either.problem == ""
     again.end()
-    assert eventually(lambda: source.problem == "the program closed the connection")
+    assert eventually(lambda: either.problem == "the program closed the connection")
 
 
 @pytest.mark.parametrize(
@@ -349,9 +368,9 @@ def jpeg_of(asked: dict, eye: dict) -> bytes:
     return coded.getvalue()
 
 
-def test_pictures_may_be_encoded_as_jpeg(source: Any) -> None:
-    program = Program(source, jpeg_of, encoding="jpeg")
-    for picture, red in zip(drawn(source), (200, 100)):
+def test_pictures_may_be_encoded_as_jpeg(either: Any) -> None:
+    program = Program(either, jpeg_of, encoding="jpeg")
+    for picture, red in zip(drawn(either), (200, 100)):
         assert np.abs(picture[2:14].astype(int) - [red, 0, 0]).max() < 8 and picture[22:].max() < 8
     program.end()
 
@@ -449,18 +468,18 @@ class Sharing(Program):
                     self.socket.send(struct.pack("<II", asked["frame"], side))
 
 
-def test_a_program_on_the_same_machine_may_share_memory(source: Any) -> None:
-    program = Sharing(source)
+def test_a_program_on_the_same_machine_may_share_memory(either: Any) -> None:
+    program = Sharing(either)
     for _ in range(10):
-        left, right = drawn(source)
+        left, right = drawn(either)
         assert (left[..., 0] == 200).all() and (right[..., 0] == 100).all()
     assert len({eye["at"] for asked in program.asked for eye in asked["eyes"]}) == 8  # four frames of two pictures
     larger = raster_views(EYES, replace(STACK, width_px=128, height_px=72).panel(0))
-    source.expect(larger, time_ns=0)
-    assert (source.render(larger[1], time_ns=0)[..., 0] == 100).all()
+    either.expect(larger, time_ns=0)
+    assert (either.render(larger[1], time_ns=0)[..., 0] == 100).all()
     assert len(program.paths) == 2
     program.end()
-    source.close()
+    either.close()
     del program.memory  # the client's own mapping
     assert eventually(lambda: open_memories() == 0)
 

@@ -1,0 +1,123 @@
+"""Serve drawing programs, in the solver's process or in one of their own."""
+
+from __future__ import annotations
+
+import secrets
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+
+from runtime.content.program_link import SENT_S, Answer, Ask, Close, Open, Opened, Server, State, link
+from runtime.content.program_pictures import IN_FLIGHT_MAX
+from runtime.content.program_server import ProgramServer
+from runtime.errors import ContentFailure, InputError
+from runtime.support.channel import Channel
+
+
+class Serving:
+    """Servers in a process of their own, as instructed by a solver's `ProgramLink`."""
+
+    def __init__(self, channel: Channel, token: str) -> None:
+        self._channel, self._token = channel, token
+        self._servers: dict[int, ProgramServer] = {}  # keyed by the port asked for
+        self._addresses: dict[int, str] = {}  # address of the last server, keyed likewise
+        self._told: dict[int, State] = {}  # latest state sent, keyed likewise
+        self._waiters = ThreadPoolExecutor(IN_FLIGHT_MAX + 1, "programs' answers")
+
+    def take(self, timeout_s: float) -> None:
+        """Carry out the solver's instructions that have arrived, or wait for one."""
+        for message in self._channel.receive(timeout_s):
+            match message:
+                case Open(port):
+                    self._told.pop(port, None)  # because another solver may ask
+                    self._send(self._opened(port, self._addresses.get(port, "")))
+                case Close(port) if port in self._servers:
+                    self._servers.pop(port).close()
+                case Ask():
+                    self._ask(message)
+        for port, server in self._servers.items():
+            self._tell(port, server)
+
+    def _opened(self, port: int, address: str) -> Opened:
+        """Open a server, if it is not open, where it was before this process, and return its state."""
+        try:
+            if port not in self._servers:
+                self._servers[port] = opened(port, self._token, address)
+                self._addresses[port] = self._servers[port].address
+        except InputError as error:
+            return Opened(port, "", error.problem)
+        return Opened(port, self._servers[port].address, "")
+
+    def _ask(self, ask: Ask) -> None:
+        opened, server = self._opened(ask.port, ask.address), self._servers.get(ask.port)
+        if server is None:
+            self._send(Answer(ask.number, {}, opened.problem))
+            return
+        try:
+            number = server.ask(ask.asked)
+        except ContentFailure as error:
+            self._send(Answer(ask.number, {}, str(error)))
+        else:
+            self._waiters.submit(self._answer, ask, server, number)
+
+    def _answer(self, ask: Ask, server: ProgramServer, number: int) -> None:
+        try:
+            pictures, why = server.drawn(number).pictures, ""
+        except ContentFailure as error:
+            pictures, why = {}, str(error)
+        self._tell(ask.port, server)
+        self._send(Answer(ask.number, {side: picture.place or picture for side, picture in pictures.items()}, why))
+
+    def _tell(self, port: int, server: ProgramServer) -> None:
+        state = State(port, server.problem, server.frame_ms)
+        if self._told.get(port) != state:
+            self._told[port] = state
+            self._send(state)
+
+    def _send(self, message: Opened | Answer | State) -> None:
+        self._channel.send(message, timeout_s=SENT_S)
+
+
+def opened(port: int, token: str, address: str = "") -> ProgramServer:
+    """Open a server on a TCP port, 0 for any, and if possible at its earlier address. Raises InputError."""
+    before = int(address.partition("/?")[0].rpartition(":")[2] or port)
+    problem = ""
+    for attempt in (before, port):
+        try:
+            return ProgramServer(attempt, token)
+        except OSError as error:
+            problem = f"cannot listen on port {attempt}: {error.strerror}"
+    raise InputError("content.options", "port", problem)
+
+
+_lock = threading.Lock()
+_token = secrets.token_urlsafe(24)  # of servers in this process
+_servers: dict[int, tuple[Server, int]] = {}  # open servers and their numbers of users, keyed by the port asked for
+_addresses: dict[int, str] = {}  # address of the last server, keyed by the port asked for
+
+
+def acquire(port: int) -> Server:
+    """Return the server for a TCP port, 0 for any, which the caller must `release`. Raises InputError if
+    it cannot be opened. The address, with the token, stays the same for the life of the server's process if the port is
+    still free, so that programs find the server again after a change of the scene.
+    """
+    with _lock:
+        server, users = _servers.get(port, (None, 0))
+        if server is None:
+            server = elsewhere.open(port) if (elsewhere := link()) else opened(port, _token, _addresses.get(port, ""))
+            _addresses[port] = server.address
+        _servers[port] = server, users + 1
+        return server
+
+
+def release(server: Server) -> None:
+    """Give back a server. It is closed when its last user has given it back."""
+    with _lock:
+        for port, (one, users) in tuple(_servers.items()):
+            if one is server:
+                if users > 1:
+                    _servers[port] = server, users - 1
+                    return
+                del _servers[port]
+    with suppress(OSError):
+        server.close()

@@ -1,0 +1,69 @@
+"""Process that serves drawing programs (`content.program_link`). It outlives the solver, which is its only client."""
+
+from __future__ import annotations
+
+import secrets
+import select
+import threading
+from importlib import import_module
+from typing import Any
+
+from runtime.support.background import begin
+from runtime.support.channel import Channel
+from runtime.support.process import Parent, Role, Worker
+from runtime.support.untrusted_input import MIB
+
+NICENESS = 5  # as the solver, which waits for it
+MEMORY_BYTES = 2048 * MIB  # for unread messages of programs that do not share memory
+ALLOWED_S, LOOK_S = 5.0, 0.25
+
+
+class Programs:
+    """Keeps the process, which is started when a solver first asks for it. Both ends of the channel between
+    the two stay open, so that each of them can be replaced.
+    """
+
+    def __init__(self) -> None:
+        """Raises OSError if the system has no descriptor left, and TransientError without a thread."""
+        self._solver_end, self._server_end = Channel.pair()
+        self._token = secrets.token_urlsafe(24)
+        self._worker: Worker | None = None
+        self._closing = threading.Event()
+        self._starter = begin("programs' starter", self._start)
+
+    @property
+    def descriptor(self) -> int:
+        """File descriptor of the channel, which each solver inherits."""
+        return self._solver_end.fileno()
+
+    def status(self) -> list[dict[str, Any]]:
+        return [] if self._worker is None else [self._worker.status()]
+
+    def close(self) -> None:
+        """End the process, if there is one."""
+        self._closing.set()
+        self._starter.join()
+        if self._worker is not None:
+            self._worker.close()
+        self._solver_end.close()
+        self._server_end.close()
+
+    def _start(self) -> None:
+        asked, end = select.poll(), self._server_end.fileno()
+        asked.register(end, select.POLLIN)
+        while not self._closing.is_set():
+            if asked.poll(1e3 * LOOK_S):
+                role = Role("program server", main, niceness=NICENESS, memory_bytes=MEMORY_BYTES)
+                self._worker = Worker(role, lambda: (end, self._token), files=(end,))
+                return
+
+
+def main(parent: Parent, descriptor: int, token: str) -> None:
+    """Serve programs until the parent closes the channel."""
+    # Imported only here, because the libraries of a server would delay the presenter's refreshes.
+    serving: Any = import_module("runtime.content.program_serving").Serving(Channel.of(descriptor), token)
+    parent.ready()
+    while True:
+        parent.allow(ALLOWED_S)
+        serving.take(LOOK_S)
+        parent.receive()
