@@ -1,4 +1,4 @@
-"""Serve drawing programs, in the solver's process or in one of their own."""
+"""Serve drawing programs, in the solver's process or in a separate one."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from runtime.support.channel import Channel
 
 
 class Serving:
-    """Servers in a process of their own, as instructed by a solver's `ProgramLink`."""
+    """Servers in a separate process, as instructed by a solver's `ProgramLink`."""
 
     def __init__(self, channel: Channel, token: str) -> None:
         self._channel, self._token = channel, token
