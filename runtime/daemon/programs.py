@@ -24,7 +24,7 @@ class Programs:
     """
 
     def __init__(self) -> None:
-        """Raises OSError if the system has no descriptor left, and TransientError without a thread."""
+        """Begin to wait. Raises OSError without a descriptor left, and TransientError without a thread."""
         self._solver_end, self._server_end = Channel.pair()
         self._token = secrets.token_urlsafe(24)
         self._worker: Worker | None = None
