@@ -49,7 +49,7 @@ class Open:
 
 @dataclass(frozen=True, slots=True)
 class Opened:
-    """Where the server for a port is."""
+    """Address of the server for a port."""
 
     port: int  # as asked for
     address: str
