@@ -41,14 +41,14 @@ class Server(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Open:
-    """Open the server for a port, which may be open. Answered by `Opened`."""
+class OpenServer:
+    """Open the server for a port, which may be open. Answered by `ServerAddress`."""
 
     port: int  # as asked for by the user; 0: any
 
 
 @dataclass(frozen=True, slots=True)
-class Opened:
+class ServerAddress:
     """Address of the server for a port."""
 
     port: int  # as asked for
@@ -57,15 +57,15 @@ class Opened:
 
 
 @dataclass(frozen=True, slots=True)
-class Close:
+class CloseServer:
     """Close the server for a port. Not answered."""
 
     port: int
 
 
 @dataclass(frozen=True, slots=True)
-class Ask:
-    """Ask a server for a frame. Answered by `Answer`."""
+class AskFrame:
+    """Ask a server for a frame. Answered by `FrameAnswer`."""
 
     port: int
     address: str  # where the server is expected, and opened if it is not
@@ -74,7 +74,7 @@ class Ask:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class FrameAnswer:
     """A frame's pictures, or why there are none."""
 
     number: int
@@ -83,8 +83,8 @@ class Answer:
 
 
 @dataclass(frozen=True, slots=True)
-class State:
-    """State of a server, sent when it changes and before any answer. `ProgramServer` describes the last two fields."""
+class ServerState:
+    """ServerState of a server, sent when it changes and before any answer. `ProgramServer` describes the last two fields."""
 
     port: int
     problem: str = ""
@@ -130,20 +130,22 @@ class ProgramLink:
     def __init__(self, channel: Channel) -> None:
         self._channel, self._lock = channel, threading.Lock()
         self._number = time.monotonic_ns()  # of the latest frame; differs from all numbers of an earlier solver
-        self._opened: dict[int, Opened] = {}  # keyed by the port asked for
-        self._states: dict[int, State] = {}  # keyed likewise
-        self._answers: dict[int, Answer | None] = {}  # keyed by number; None: not answered
+        self._opened: dict[int, ServerAddress] = {}  # keyed by the port asked for
+        self._states: dict[int, ServerState] = {}  # keyed likewise
+        self._answers: dict[int, FrameAnswer | None] = {}  # keyed by number; None: not answered
         self._memory: dict[tuple[int, int], memoryview] = {}  # keyed by device and inode
 
     def open(self, port: int) -> LinkedServer:
         """Open the server for a port. Raises InputError."""
         with self._lock:
             self._opened.pop(port, None)
-            self.send(Open(port))
+            self.send(OpenServer(port))
             ends_s = time.monotonic() + OPENED_S
             while port not in self._opened and time.monotonic() < ends_s:
                 self._receive(SENT_S)
-            opened = self._opened.get(port, Opened(port, "", "the process that serves programs cannot be started"))
+            opened = self._opened.get(
+                port, ServerAddress(port, "", "the process that serves programs cannot be started")
+            )
         if opened.problem:
             raise InputError("content.options", "port", opened.problem)
         return LinkedServer(self, port, opened.address)
@@ -151,7 +153,7 @@ class ProgramLink:
     def close(self, port: int) -> None:
         """Close the server for a port."""
         self._memory = {}
-        self.send(Close(port))
+        self.send(CloseServer(port))
 
     def ask(self, port: int, address: str, asked: AskedViews) -> int:
         """Request a frame's pictures, and return its number."""
@@ -159,10 +161,10 @@ class ProgramLink:
             self._number += 1
             self._answers = {number: a for number, a in self._answers.items() if number > self._number - IN_FLIGHT_MAX}
             self._answers[self._number] = None
-            self.send(Ask(port, address, self._number, asked))
+            self.send(AskFrame(port, address, self._number, asked))
             return self._number
 
-    def answer(self, number: int) -> Answer | None:
+    def answer(self, number: int) -> FrameAnswer | None:
         """Wait for the answer to a request, or return None if it is late."""
         ends_s = time.monotonic() + ANSWERED_S + LATE_S
         with self._lock:
@@ -170,11 +172,11 @@ class ProgramLink:
                 self._receive(ends_s - time.monotonic())
             return self._answers.get(number)
 
-    def state(self, port: int) -> State:
+    def state(self, port: int) -> ServerState:
         """Return the latest state of the server for a port."""
         with self._lock:
             self._receive(0.0)
-            return self._states.get(port) or State(port)
+            return self._states.get(port) or ServerState(port)
 
     def send(self, message: Any) -> None:
         """Send a message. One that is not read in time is lost, as one that a crash loses."""
@@ -183,13 +185,13 @@ class ProgramLink:
     def _receive(self, timeout_s: float) -> None:
         for message in self._channel.receive(max(timeout_s, 0.0)):
             match message:
-                case Opened():
+                case ServerAddress():
                     self._opened[message.port] = message
-                case State():
+                case ServerState():
                     self._states[message.port] = message
                     if message.problem:  # the program is gone, and its memory is not used again
                         self._memory = {}
-                case Answer() if message.number in self._answers:
+                case FrameAnswer() if message.number in self._answers:
                     self._answers[message.number] = message
 
     def mapped(self, place: SharedPlace) -> ProgramPicture:

@@ -7,7 +7,17 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 
-from runtime.content.program_link import SENT_S, Answer, Ask, Close, Open, Opened, Server, State, link
+from runtime.content.program_link import (
+    SENT_S,
+    FrameAnswer,
+    AskFrame,
+    CloseServer,
+    OpenServer,
+    ServerAddress,
+    Server,
+    ServerState,
+    link,
+)
 from runtime.content.program_pictures import IN_FLIGHT_MAX
 from runtime.content.program_server import ProgramServer
 from runtime.errors import ContentFailure, InputError
@@ -21,60 +31,60 @@ class Serving:
         self._channel, self._token = channel, token
         self._servers: dict[int, ProgramServer] = {}  # keyed by the port asked for
         self._addresses: dict[int, str] = {}  # address of the last server, keyed likewise
-        self._told: dict[int, State] = {}  # latest state sent, keyed likewise
+        self._told: dict[int, ServerState] = {}  # latest state sent, keyed likewise
         self._waiters = ThreadPoolExecutor(IN_FLIGHT_MAX + 1, "programs' answers")
 
     def take(self, timeout_s: float) -> None:
         """Carry out the solver's instructions that have arrived, or wait for one."""
         for message in self._channel.receive(timeout_s):
             match message:
-                case Open(port):
+                case OpenServer(port):
                     self._told.pop(port, None)  # because another solver may ask
                     self._send(self._opened(port, self._addresses.get(port, "")))
-                case Close(port) if port in self._servers:
+                case CloseServer(port) if port in self._servers:
                     self._servers.pop(port).close()
-                case Ask():
+                case AskFrame():
                     self._ask(message)
         for port, server in self._servers.items():
             self._tell(port, server)
 
-    def _opened(self, port: int, address: str) -> Opened:
+    def _opened(self, port: int, address: str) -> ServerAddress:
         """Open a server, if it is not open, where it was before this process, and return its state."""
         try:
             if port not in self._servers:
                 self._servers[port] = opened(port, self._token, address)
                 self._addresses[port] = self._servers[port].address
         except InputError as error:
-            return Opened(port, "", error.problem)
-        return Opened(port, self._servers[port].address, "")
+            return ServerAddress(port, "", error.problem)
+        return ServerAddress(port, self._servers[port].address, "")
 
-    def _ask(self, ask: Ask) -> None:
+    def _ask(self, ask: AskFrame) -> None:
         opened, server = self._opened(ask.port, ask.address), self._servers.get(ask.port)
         if server is None:
-            self._send(Answer(ask.number, {}, opened.problem))
+            self._send(FrameAnswer(ask.number, {}, opened.problem))
             return
         try:
             number = server.ask(ask.asked)
         except ContentFailure as error:
-            self._send(Answer(ask.number, {}, str(error)))
+            self._send(FrameAnswer(ask.number, {}, str(error)))
         else:
             self._waiters.submit(self._answer, ask, server, number)
 
-    def _answer(self, ask: Ask, server: ProgramServer, number: int) -> None:
+    def _answer(self, ask: AskFrame, server: ProgramServer, number: int) -> None:
         try:
             pictures, why = server.drawn(number).pictures, ""
         except ContentFailure as error:
             pictures, why = {}, str(error)
         self._tell(ask.port, server)
-        self._send(Answer(ask.number, {side: picture.place or picture for side, picture in pictures.items()}, why))
+        self._send(FrameAnswer(ask.number, {side: picture.place or picture for side, picture in pictures.items()}, why))
 
     def _tell(self, port: int, server: ProgramServer) -> None:
-        state = State(port, server.problem, server.frame_ms)
+        state = ServerState(port, server.problem, server.frame_ms)
         if self._told.get(port) != state:
             self._told[port] = state
             self._send(state)
 
-    def _send(self, message: Opened | Answer | State) -> None:
+    def _send(self, message: ServerAddress | FrameAnswer | ServerState) -> None:
         self._channel.send(message, timeout_s=SENT_S)
 
 
