@@ -84,7 +84,7 @@ class FrameAnswer:
 
 @dataclass(frozen=True, slots=True)
 class ServerState:
-    """ServerState of a server, sent when it changes and before any answer. `ProgramServer` describes the last two fields."""
+    """State of a server, sent when it changes and before any answer. `ProgramServer` describes the last two fields."""
 
     port: int
     problem: str = ""

@@ -9,12 +9,12 @@ from contextlib import suppress
 
 from runtime.content.program_link import (
     SENT_S,
-    FrameAnswer,
     AskFrame,
     CloseServer,
+    FrameAnswer,
     OpenServer,
-    ServerAddress,
     Server,
+    ServerAddress,
     ServerState,
     link,
 )
