@@ -1,4 +1,4 @@
-"""Link between a solver and the process that serves drawing programs, which stay connected while it is replaced."""
+"""Link between a solver and the process that serves drawing programs while solvers change."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class FrameAnswer:
 
 @dataclass(frozen=True, slots=True)
 class ServerState:
-    """State of a server, sent when it changes and before any answer. `ProgramServer` describes the last two fields."""
+    """State of a server, sent when it changes and before any answer (`ProgramServer`)."""
 
     port: int
     problem: str = ""

@@ -52,7 +52,7 @@ class DrawnPictures:
 
 @dataclass(frozen=True, slots=True)
 class SharedPlace:
-    """Place of a picture in memory shared with a program, which any process of the same user can map."""
+    """Place of a picture in memory that a program shares with all processes of its user."""
 
     path: str
     memory_bytes: int
@@ -91,8 +91,9 @@ class PictureForm:
         return ProgramPicture(pixels[:: self._order], self._depth_in(data[end:]))
 
     def picture(self, data: memoryview, place: SharedPlace | None = None) -> ProgramPicture:
-        """Return the raw picture in a message or, at a place, in shared memory, without copying it. Raises ValueError
-        if the data has the wrong size.
+        """Return the raw picture in a message or in shared memory, not copied.
+
+        Raises ValueError if the data has the wrong size.
         """
         if len(data) != self.bytes:
             parts = "RGBA pixels" if self.depth is None else f"RGBA pixels and {self.depth.name} depths"

@@ -89,7 +89,7 @@ class Serving:
 
 
 def opened(port: int, token: str, address: str = "") -> ProgramServer:
-    """Open a server on a TCP port, 0 for any, and if possible at its earlier address. Raises InputError."""
+    """Open a server on a TCP port, 0 for any, if possible where it was. Raises InputError."""
     before = int(address.partition("/?")[0].rpartition(":")[2] or port)
     problem = ""
     for attempt in (before, port):

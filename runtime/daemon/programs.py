@@ -1,4 +1,4 @@
-"""Process that serves drawing programs (`content.program_link`). It outlives the solver, which is its only client."""
+"""Process that serves drawing programs, and outlives the solver (`content.program_link`)."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ ALLOWED_S, LOOK_S = 5.0, 0.25
 
 
 class Programs:
-    """Keeps the process, which is started when a solver first asks for it. Both ends of the channel between
-    the two stay open, so that each of them can be replaced.
+    """Keeps the process, which is started when a solver first asks for it.
+
+    Both ends of the channel between the two stay open, so that each of them can be replaced.
     """
 
     def __init__(self) -> None:
