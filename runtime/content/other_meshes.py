@@ -32,6 +32,11 @@ BOMS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 # Options that precede a texture's name in an MTL file, such as `-s 1 1 1`, `-blendu off` or `-imfchan r`.
 OPTIONS = re.compile(r"(?:-[a-zA-Z]+(?:\s+(?:on|off|[rgbmlz]|[-+.\d]+(?:[eE][-+]?\d+)?))*\s+)+")
 BEHIND_NUMBERS = re.compile(r"^([ \t]*(?:v|vt|vn|vp|f|l|p)[ \t][^#\n]*)#.*", re.MULTILINE)  # comment in an OBJ file
+COLOURED = re.compile(r"^v(?:[ \t]+[^\s#]+){6}", re.MULTILINE)
+UNCOLOURED_VERTEX = re.compile(r"^v(?:[ \t]+[^\s#]+){3}(?=[ \t\r]*$)", re.MULTILINE)
+COUNTS_BACK = re.compile(r"^[fl][ \t].*-", re.MULTILINE)
+LIBRARIES = re.compile(r"^[ \t]*mtllib[ \t]+(.*\S)", re.MULTILINE)
+BETWEEN_LIBRARIES = re.compile(r"(?<=\.mtl)\s+", re.IGNORECASE)
 DRIVE = re.compile(r"[A-Za-z]:.*/")  # folder on the author's Windows machine, which is stripped from paths
 
 
@@ -41,23 +46,28 @@ class FolderResolver(trimesh.resolvers.FilePathResolver):
     loaders discard exceptions.
     """
 
-    def __init__(self, path: Path, read: Read, *, has_materials: bool) -> None:
+    def __init__(self, path: Path, read: Read, *, libraries: list[str], has_texture: bool) -> None:
+        """Read with `read`. `libraries`: all material files, of which trimesh would ask for the first line's alone."""
         super().__init__(str(path))
-        self._path, self._read, self._pixels = path, read, 0
+        self._path, self._read, self._pixels, self._libraries = path, read, 0, libraries
         self.refused: InputError | None = None
-        self.has_materials = has_materials
+        self.has_materials = has_texture
 
     def get(self, name: str) -> bytes:
-        is_material = name.lower().endswith(".mtl")
+        if name.lower().endswith(".mtl"):
+            return b"\n".join(self._get(library, is_material=True) for library in self._libraries)
+        return self._get(name, is_material=False)
+
+    def _get(self, name: str, *, is_material: bool) -> bytes:
         try:
             file_name = self._named(name)
             if file_name is None:
                 what = "materials" if is_material else "texture"
                 why = f"{untrusted_input.shown(name)} does not exist"
                 log.warning("%s: drawing the mesh in grey without its %s because %s", self._path, what, why)
-                self.has_materials = self.has_materials and not is_material
                 return b"" if is_material else _grey()
             data = self._read(file_name)
+            self.has_materials |= is_material
             if not is_material:
                 image = decoded_picture(data, source=self._path, field="texture", name=untrusted_input.shown(name))
                 self._pixels += image.width * image.height
@@ -84,13 +94,12 @@ def read_mesh(path: Path, data: bytes, read: Read, origin: Origin) -> tuple[list
     """
     kind = path.suffix.lower().removeprefix(".")
     progress.tell(f"{path.name}: triangles", 0)
-    mark = {"obj": b"mtllib", "ply": b"TextureFile"}.get(kind, b"")
-    resolver = FolderResolver(
-        path, read, has_materials=mark in data.replace(b"\0", b"") if data[:2] in BOMS else mark in data
-    )
+    text = _text(data) if kind == "obj" else ""
+    libraries = [name for line in LIBRARIES.findall(text) for name in BETWEEN_LIBRARIES.split(line)]
+    resolver = FolderResolver(path, read, libraries=libraries, has_texture=kind == "ply" and b"TextureFile" in data)
     try:
         data = _joined(data) if kind == "off" else _without_comments(path, kind, data)
-        file = io.StringIO(_text(data)) if kind == "obj" else io.BytesIO(data)
+        file = io.StringIO(text) if kind == "obj" else io.BytesIO(data)
         scene = trimesh.load_scene(file, file_type=kind, resolver=resolver, process=False)
         meshes = [(scene.geometry[name], matrix) for matrix, name in map(scene.graph.get, scene.graph.nodes_geometry)]
         has_faces = any(len(getattr(mesh, "faces", ())) for mesh, _ in meshes)
@@ -144,8 +153,28 @@ def _joined(data: bytes) -> bytes:
 
 
 def _text(data: bytes) -> str:
-    """Decode an OBJ file, UTF-16 or UTF-8, without comments behind numbers; replace invalid characters of names."""
-    return BEHIND_NUMBERS.sub(r"\1", data.decode("utf-16" if data[:2] in BOMS else "utf-8", errors="replace"))
+    """Decode an OBJ file, UTF-16 or UTF-8, and replace invalid characters of names, and what trimesh misunderstands:
+    comments behind numbers, vertices without colours among others, and numbers that count back from their line.
+    """
+    text = BEHIND_NUMBERS.sub(r"\1", data.decode("utf-16" if data[:2] in BOMS else "utf-8", errors="replace"))
+    if COLOURED.search(text):
+        text = UNCOLOURED_VERTEX.sub(rf"\g<0> {' '.join(map(str, UNCOLOURED))}", text)
+    return _counted(text.replace("\\\n", " ")) if COUNTS_BACK.search(text) else text
+
+
+def _counted(text: str) -> str:
+    """Number the vertices of faces and lines from the OBJ file's start where they are numbered from their line."""
+    lines, counts = text.splitlines(), dict.fromkeys(("v", "vt", "vn"), 0)
+    for place, line in enumerate(lines):
+        kind, *corners = line.split() or [""]
+        if kind in counts:
+            counts[kind] += 1
+        elif kind in ("f", "l") and "-" in line:
+            total = tuple(counts.values())
+            numbers = [zip(corner.split("/"), total, strict=False) for corner in corners]
+            ends = ["/".join(str(n + 1 + int(at)) if at[:1] == "-" else at for at, n in corner) for corner in numbers]
+            lines[place] = " ".join([kind, *ends])
+    return "\n".join(lines)
 
 
 def _wires(file: io.StringIO, origin: Origin) -> F32 | None:
@@ -184,7 +213,7 @@ def _part(mesh: Any, matrix: F64, path: Path, pictures: dict[int, U8], origin: O
     """
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,) or faces.min() < 0 or faces.max() >= len(vertices):
-        raise InputError(path, "faces", "some faces refer to vertices that do not exist")
+        raise InputError(path, "faces", "some faces refer to vertices that do not exist or have no z coordinate")
     visual, kind = mesh.visual, mesh.visual.kind
     picture, colour, opacity, colours = None, UNCOLOURED, 1.0, None
     if kind == "texture":

@@ -443,6 +443,33 @@ COMMENTED = {
 }
 
 
+@pytest.mark.parametrize("libraries", ["mtllib a.mtl b.mtl\n", "mtllib a.mtl\nmtllib none.mtl\nmtllib b.mtl\n"])
+def test_an_obj_may_have_several_files_of_materials(tmp_path: Path, libraries: str) -> None:
+    (tmp_path / "a.mtl").write_text("newmtl red\nKd 1 0 0\n")
+    (tmp_path / "b.mtl").write_text("newmtl green\nKd 0 1 0\n")
+    (tmp_path / "a.obj").write_text(libraries + TRIANGLE + "usemtl red\nf 1 2 3\nusemtl green\nf 3 2 1\n")
+    assert {part.colour for part in load_mesh(tmp_path / "a.obj").parts} == {(1.0, 0.0, 0.0), (0.0, 1.0, 0.0)}
+
+
+def test_numbers_that_count_back_in_an_obj_do_so_from_their_line(tmp_path: Path) -> None:
+    triangle = "v {0} 0 0\nv {0} 1 0\nvt 0 {0}\nvt 1 {0}\nv {0} 0 1\nvt 1 1\nf -3/-3 -2/-2 \\\n-1/-1\n"
+    (tmp_path / "a.obj").write_text(triangle.format(0) + "# -1\n" + triangle.format(5) + "f 1/1 -2/5 -1/6\nl -1 -2\n")
+    (part,) = load_mesh(tmp_path / "a.obj").parts
+    assert [sorted(xs) for xs in part.shape.positions_m[part.shape.triangles, 0].tolist()] == [
+        [0] * 3,
+        [5] * 3,
+        [0, 5, 5],
+    ]
+
+
+def test_vertices_of_an_obj_without_colours_are_grey_among_coloured_ones(tmp_path: Path) -> None:
+    """Objects of several programs in one file; the first has no colours."""
+    (tmp_path / "a.obj").write_text(TRIANGLE + "f 1 2 3\nv 5 0 0 1 0 0\nv 6 0 0 1 0 0\nv 5 1 0 1 0 0\nf 4 5 6\n")
+    (part,) = load_mesh(tmp_path / "a.obj").parts
+    assert part.vertex_colours is not None and part.vertex_colours[3:].tolist() == [[1, 0, 0]] * 3
+    assert np.ptp(part.vertex_colours[:3], axis=0).max() == 0 and 0.6 < part.vertex_colours[0].min() < 0.9
+
+
 @pytest.mark.parametrize("head", ["OFF\n4 1 0\n", "# one\nOFF 4 1 0 # counts\n", "OFF4 1 0\n"])
 def test_elements_of_an_off_file_may_take_several_lines(tmp_path: Path, head: str) -> None:
     (tmp_path / "a.off").write_text(head + "0 0\n0\n1 0 0\n\n1 1 # corner\n0\n0 1 0\n4 0 1\n2\n3 255 0 0\n")
