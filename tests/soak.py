@@ -34,7 +34,7 @@ from runtime.daemon.build import RunOptions
 from runtime.daemon.client import ask
 from runtime.errors import SensorLost
 from runtime.frame import solver_process
-from runtime.panels import window
+from runtime.panels import drawing
 from runtime.sensor.replay import ReplayDriver
 from tests.panels.xserver import HEIGHT_PX, WIDTH_PX, XServer
 
@@ -170,7 +170,7 @@ def soak(seconds: float, *, growth_mib: int, windows: bool = False) -> None:
             server = XServer(folder)
             cleanup.callback(server.stop)
             cleanup.enter_context(patch.dict(os.environ, DISPLAY=server.name))
-            cleanup.enter_context(patch.object(window, "_reset_status", run.reset(window._reset_status)))
+            cleanup.enter_context(patch.object(drawing, "_reset_status", run.reset(drawing._reset_status)))
             beside.append(threading.Timer(8.0, run.harm, (server,)))
         for thread in beside:
             thread.daemon = True
