@@ -75,7 +75,7 @@ class QualitySampler:
     ) -> None:
         self._stack, self._drawer, self._truth = stack, drawer, truth
         self._every, self._simulated, self._newest = every, simulated, newest
-        self._rests_at: F64 | None = None  # (2, 3) the eyes since `_rests_since_s`, to within `MOVED_M`
+        self._rests_at: RefreshAccount | None = None  # has the eyes since `_rests_since_s`, to within `MOVED_M`
         self._rests_since_s = 0.0
         self._tried: Refresh | None = None  # latest refresh to be measured
         self._shown, self._shown_since_s = -1, 0.0  # number of the solution shown, and since when
@@ -111,8 +111,8 @@ class QualitySampler:
         account, solution, now_s = refresh.account, refresh.solution, time.monotonic()
         if not is_measurable(refresh) or account.eyes_m is None or solution is None:
             return
-        if self._rests_at is None or np.abs(account.eyes_m - self._rests_at).max() > MOVED_M:
-            self._rests_at, self._rests_since_s = account.eyes_m, now_s
+        if self._rests_at is None or not _rest(self._rests_at, account):
+            self._rests_at, self._rests_since_s = account, now_s
         if self._shown != solution.number:
             self._shown, self._shown_since_s = solution.number, now_s
         measured = None if self.moment is None or not applies_to(self.moment, refresh) else self.moment.account
@@ -326,23 +326,19 @@ def is_measurable(refresh: Refresh) -> bool:
 def applies_to(moment: Moment, refresh: Refresh) -> bool:
     """Return True if a measurement of the same content, model and eyes holds for a refresh."""
     account = moment.account
-    return (
-        account is not None
-        and is_measurable(refresh)
-        and _alike((moment.state_version, account.eyes_m), (refresh.state_version, refresh.account.eyes_m))
-    )
+    is_current = is_measurable(refresh) and moment.state_version == refresh.state_version
+    return account is not None and is_current and _rest(account, refresh.account)
 
 
 def _is_alike(before: Refresh, now: Refresh) -> bool:
-    return _alike((before.state_version, before.account.eyes_m), (now.state_version, now.account.eyes_m))
+    return before.state_version == now.state_version and _rest(before.account, now.account)
 
 
-def _alike(one: tuple[int, F64 | None], other: tuple[int, F64 | None]) -> bool:
-    """Return True if two refreshes belong to the same run state and their eyes (2, 3) are within `MOVED_M`."""
-    (version, eyes_m), (other_version, other_m) = one, other
-    return (
-        version == other_version
-        and eyes_m is not None
-        and other_m is not None
-        and bool(np.abs(eyes_m - other_m).max() <= MOVED_M)
+def _rest(before: RefreshAccount, now: RefreshAccount) -> bool:
+    """Return True if as many people are served at two refreshes, and their eyes are within `MOVED_M`."""
+    then_m, now_m = (
+        [person.eyes_m for person in account.people or (account,) if person.eyes_m is not None]
+        for account in (before, now)
     )
+    moved_m = (np.abs(one - other).max() for one, other in zip(then_m, now_m, strict=False))
+    return 0 < len(then_m) == len(now_m) and all(away_m <= MOVED_M for away_m in moved_m)

@@ -27,7 +27,7 @@ from runtime.optics.focus import retina_db
 from runtime.optics.presentation import shown_layers
 from runtime.plan.drawing import drawn_job, retina_pictures
 from runtime.plan.focusing import focus_targets, focused_job
-from runtime.records import Effort, PanelFrame, RefreshAccount, SensorFrame, Solution, State
+from runtime.records import Effort, PanelFrame, PersonAccount, RefreshAccount, SensorFrame, Solution, State
 from runtime.support.background import wait_for_all
 from tests.frame.conftest import SMALL
 from tests.frame.fakes import EYES, FakeSolver, aside, facts
@@ -510,6 +510,21 @@ def test_a_live_figure_applies_to_these_eyes_and_this_state_alone(content: Conte
     assert observer.light(stale)["light_age_s"] is None
     assert measured(aside(0.02), 1, replace(solved, number=2, state_version=1))
     assert light(moved) is None
+
+
+def test_a_live_figure_applies_until_either_of_two_people_moves(content: ContentSource, solved: Solution) -> None:
+    observer, _ = looking(content, simulated=False, newest=True)
+    numbers = count(1)
+
+    def light(*places: Any) -> float | None:
+        people = tuple(PersonAccount(number, eyes_m, eyes_m) for number, eyes_m in enumerate(places, start=1))
+        shown = refresh(next(numbers), solved, people=people)
+        observer.refreshed(shown)
+        return observer.light(shown)["light_db"]
+
+    assert eventually(lambda: light(EYES, aside(0.2)) is not None)
+    assert light(EYES, aside(0.22)) is None
+    assert light(EYES) is None
 
 
 def test_a_live_figure_has_an_age_and_follows_a_better_solution(content: ContentSource, solved: Solution) -> None:
