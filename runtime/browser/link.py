@@ -13,8 +13,9 @@ import cv2
 import numpy as np
 
 from runtime.optics.stack import PanelStack
-from runtime.records import EyePoints, Eyes, PanelFrame, SensorFrame
+from runtime.records import F64, EyePoints, Eyes, PanelFrame, SensorFrame
 
+FASTEST_M_S = 5.0  # maximum speed of a head
 PAGES_MAX = 8  # maximum number of live pages, because pictures are sent to each of them
 SAMPLES_MAX = 256  # maximum number of samples waiting for the sensor
 CAPTURES_MAX = 512  # for how many captures the time on the page's clock is stored
@@ -27,6 +28,8 @@ class SeenEyes:
 
     eyes_m: Eyes | None  # (2, 3) eyes in the `stack` frame; None without a viewer
     page_ms: float  # the sample's time on the page's clock
+    head: int = 0  # whose eyes, see `BrowserLink.head_of`
+    velocity_m_s: F64 | None = None  # (3,) of both eyes; None: they rest
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,8 +38,9 @@ class PageMode:
 
     stack: PanelStack
     fov_deg: float  # the target pictures' horizontal field of view
-    is_sensor: bool = True  # the viewer's page sends eye positions; otherwise they are measured with a camera
-    is_camera: bool = False  # the viewer's page sends camera pictures
+    is_sensor: bool = True  # pages send eye positions; otherwise they are measured with a camera
+    is_camera: bool = False  # the page that has been connected longest sends camera pictures
+    heads: int = 1  # number of pages whose eyes are used, one head each
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,8 +64,8 @@ class Shown:
 class BrowserLink:
     """Latest values that the refresh loop and all pages that show the display exchange.
     Each is replaced as a whole.
-    Thread-safe. The page that has been connected longest is the viewer: only its samples or camera pictures are used,
-    and all other pages just watch.
+    Thread-safe. The first `PageMode.heads` pages each move a head, until they leave; all other pages just watch. Camera
+    pictures are used only from the page that has been connected longest.
     """
 
     def __init__(self, mode: PageMode) -> None:
@@ -71,10 +75,11 @@ class BrowserLink:
         self.found: Mapping[str, Any] | None = None  # latest camera picture and the pupils found in it
         self.wishes: Mapping[str, float] = {}  # changes requested that need a restart: gap_mm, camera
         self._pages: dict[object, Callable[[], None]] = {}  # called when data changes
+        self._heads: list[object | None] = [None] * mode.heads  # page that moves each head
         self._arrived = threading.Condition()
         self._picture: tuple[bytes, float] | None = None  # encoded camera picture and its time on the page's clock
         self._samples: deque[SeenEyes] = deque(maxlen=SAMPLES_MAX)
-        self._captures: deque[tuple[int, float]] = deque(maxlen=CAPTURES_MAX)
+        self._captures: deque[tuple[int, SeenEyes]] = deque(maxlen=CAPTURES_MAX)
 
     def join(self, page: object, notify: Callable[[], None]) -> bool:
         """Connect a page, which is notified of changes on any thread.
@@ -83,19 +88,30 @@ class BrowserLink:
         if len(self._pages) >= PAGES_MAX:
             return False
         self._pages[page] = notify
+        self._give_heads()
         return True
 
     def leave(self, page: object) -> None:
-        """Disconnect a page. If it was the viewer's, the viewer or the camera is gone."""
-        was_viewer = self.is_viewer(page)
+        """Disconnect a page, which ends its camera. Its head goes to the page that has watched longest."""
+        head, had_camera = self.head_of(page), self.is_camera(page)
         del self._pages[page]
-        if was_viewer and self.mode.is_sensor:
-            self.see(None, 0.0)
-        elif was_viewer and self.mode.is_camera:
+        if head is not None:
+            self.see(None, 0.0, head)
+            self._heads[head] = None
+            self._give_heads()
+        if had_camera and self.mode.is_camera:
             self.wish("camera", 0.0)
 
-    def is_viewer(self, page: object) -> bool:
-        """Return True if `page` is the viewer's page, the one connected longest."""
+    def _give_heads(self) -> None:
+        watching = (page for page in self._pages if page not in self._heads)
+        self._heads = [next(watching, None) if page is None else page for page in self._heads]
+
+    def head_of(self, page: object) -> int | None:
+        """Return the number, from 0, of the head that a page moves, or None if it only watches."""
+        return self._heads.index(page) if self.mode.is_sensor and page in self._heads else None
+
+    def is_camera(self, page: object) -> bool:
+        """Return True if only this page may send camera pictures, because it has been connected longest."""
         return next(iter(self._pages), None) is page
 
     def wish(self, name: str, value: float) -> None:
@@ -107,15 +123,21 @@ class BrowserLink:
         self.wishes, self.found, self.shown = {}, None, Shown(told=self.shown.told)
         self.mode = mode
 
-    def see(self, eyes_m: Any, page_ms: float) -> None:
-        """Add eyes (2, 3) in `stack`, or None. Raises ValueError if they are not in front of the front panel."""
-        eyes = None
+    def see(self, eyes_m: Any, page_ms: float, head: int = 0, velocity_m_s: Any = None) -> None:
+        """Add a head's eyes (2, 3) in `stack`, or None. Raises ValueError if they are not in front of
+        all panels or too fast.
+        """
+        eyes = velocity = None
+        if velocity_m_s is not None:
+            velocity = np.array(velocity_m_s, np.float64)
+            if velocity.shape != (3,) or not np.abs(velocity).max() <= FASTEST_M_S:
+                raise ValueError(f"velocity: must be three numbers of at most {FASTEST_M_S} m/s")
         if eyes_m is not None:
             eyes = np.array(eyes_m, np.float64)
             if eyes.shape != (2, 3) or not np.isfinite(eyes).all() or eyes[:, 0].min() <= self.mode.stack.x_m[-1]:
                 raise ValueError("eyes: must be two points in metres that are in front of the front panel")
         with self._arrived:
-            self._samples.append(SeenEyes(eyes, float(page_ms)))
+            self._samples.append(SeenEyes(eyes, float(page_ms), head, velocity))
             self._arrived.notify()
 
     def seen(self, timeout_s: float) -> list[SeenEyes]:
@@ -146,13 +168,14 @@ class BrowserLink:
         self.found = found
         self._notify()
 
-    def captured(self, capture_ns: int, page_ms: float) -> None:
-        """Store a capture's time on the page's clock."""
-        self._captures.append((capture_ns, page_ms))
+    def captured(self, capture_ns: int, sample: SeenEyes) -> None:
+        """Store a sample's capture time."""
+        self._captures.append((capture_ns, sample))
 
-    def page_ms_of(self, capture_ns: int) -> float | None:
-        """Return the page's time of the latest sample captured at or before `capture_ns`, or None."""
-        return next((page_ms for ns, page_ms in reversed(tuple(self._captures)) if ns <= capture_ns), None)
+    def page_ms_of(self, capture_ns: int, head: int) -> float | None:
+        """Return the page's time of a head's latest sample captured at or before `capture_ns`, or None."""
+        captures = reversed(tuple(self._captures))
+        return next((one.page_ms for ns, one in captures if ns <= capture_ns and one.head == head), None)
 
     def show(self, frame: PanelFrame, told: Mapping[str, Any], *, moment: Any) -> None:
         """Publish the latest frame, its refresh's status and the latest measured refresh to all pages."""

@@ -53,7 +53,8 @@ def try_display(settings: Settings, *, port: int, opens: bool, seconds: float | 
     InputError if the port is in use, or for the settings.
     """
     is_sensor = settings.sensor.driver == "browser"
-    link = BrowserLink(PageMode(settings.stack.stack(), settings.content.fov_deg, is_sensor=is_sensor))
+    stack, fov_deg, heads = settings.stack.stack(), settings.content.fov_deg, settings.most_viewers
+    link = BrowserLink(PageMode(stack, fov_deg, is_sensor=is_sensor, heads=heads))
     ends_s = float("inf") if seconds is None else time.monotonic() + seconds
 
     def until() -> str:

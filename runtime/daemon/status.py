@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from base64 import b64encode
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -50,23 +50,26 @@ def holds(facts: Facts, *, paused: bool, flat_asked: bool) -> dict[str, Any]:
     }
 
 
-def shown(status: Status, *, light: Mapping[str, Any], page_ms: float | None) -> dict[str, Any]:
+def shown(status: Status, *, light: Mapping[str, Any], head_of: Callable[[int], int | None]) -> dict[str, Any]:
     """Return what a page that displays the panels needs to know of the latest refresh.
-    Its newest sample was captured at `page_ms` on the page's clock.
+    `head_of` returns the number of a person's head in the sensor's true eyes.
     """
     account, frame, solution = status.refresh.account, status.refresh.frame, status.refresh.solution
+    solved_for = []
+    if solution is not None and solution.solved_for_m is not None:
+        solved_for = [*zip(solution.people, solution.solved_for_m.reshape(-1, 2, 3), strict=True)]
     return {
         "frame": account.frame,
         "state": status.name,
         "reason": status.reason,
-        "eyes_m": account.eyes_m,
+        "people": [{"number": p.number, "eyes_m": p.eyes_m, "head": head_of(p.number)} for p in account.people],
+        "capture_ns": account.capture_ns,
         "eyes_label": account.eyes_label,
         "eye_sigma_mm": account.eye_sigma_mm,
         "flatness": 1.0 if frame.solved is None else frame.flatness,
-        "solved_for_m": None if solution is None or solution.solved_for_m is None else solution.solved_for_m[:2],
+        "solved_for": [{"number": number, "eyes_m": eyes_m} for number, eyes_m in solved_for],
         "scene": status.settings.content.scene,
         "model": status.settings.model.name,
-        "page_ms": page_ms,
         **light,
     }
 

@@ -88,9 +88,9 @@ class Daemon(Host):
             loading, refused, recorder = changes.loading, changes.refused, self.recorder
             self._server.publish(lambda: answers.snapshot(status, run) | _news(loading, refused, recorder))
         if self._link is not None:
-            page_ms = self._link.page_ms_of(account.capture_ns)
-            told = answers.shown(status, light=run.observer.light(status.refresh), page_ms=page_ms)
-            self._link.show(status.refresh.frame, told, moment=run.observer.moment)
+            observer = run.observer
+            told = answers.shown(status, light=observer.light(status.refresh), head_of=observer.truth.place_of)
+            self._link.show(status.refresh.frame, told, moment=observer.moment)
 
     def watches(self, run: Run) -> None:
         self.run, self.changes = run, Changes(run.presenter)

@@ -60,6 +60,11 @@ class TrueEyes:
                     place = self._place_of[person.number] = int(np.nanargmin(away_m))
                     served.add(place)
 
+    def place_of(self, number: int) -> int | None:
+        """Return a person's index among the true people, or None until it is known."""
+        is_one = bool(self._known) and len(self._known[-1][1]) == 2
+        return 0 if is_one else self._place_of.get(number)
+
     def of(self, account: RefreshAccount) -> RefreshAccount:
         """Return a refresh's account with the true eyes of all people served, where they are known."""
         all_m = self.at(account.photon_ns)

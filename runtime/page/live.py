@@ -64,7 +64,7 @@ class _Page:
             link, mode, shown = self._link, self._link.mode, self._link.shown
             if self._mode is not mode:
                 self._mode, self._sent = mode, {"solved": 0, "flat": 0}
-                fields = {"fov_deg": mode.fov_deg, "is_sensor": mode.is_sensor, "is_camera": mode.is_camera}
+                fields = {name: getattr(mode, name) for name in ("fov_deg", "is_sensor", "is_camera", "heads")}
                 await self._say({"stack": stack_table(mode.stack), **fields})
             frame, moment = shown.frame, shown.moment
             if self._checks and moment is not None and moment is not self._moment and not self._under_way:
@@ -76,37 +76,42 @@ class _Page:
                 ):
                     if layers is not None and version != self._sent[kind] and not self._under_way:
                         self._sent[kind], self._under_way = version, True
-                        await self._send_layers(kind, layers, relief, shown.told.get("solved_for_m"))
+                        await self._send_layers(kind, layers, relief, shown.told.get("solved_for"))
             if shown.told is not told:
                 told = shown.told
-                await self._say({"refresh": told, "viewer": link.is_viewer(me)})
+                head = link.head_of(me)
+                page_ms = link.page_ms_of(told.get("capture_ns", 0), head or 0)
+                await self._say({"refresh": told, "head": head, "page_ms": page_ms})
             if link.found is not found and link.found is not None:
                 found = link.found
                 await self._say({"found": found})
             await self.news.wait()
             self.news.clear()
 
-    async def _send_layers(self, kind: str, layers: U8, relief: F32 | None, solved_for_m: Any) -> None:
+    async def _send_layers(self, kind: str, layers: U8, relief: F32 | None, solved_for: Any) -> None:
         """Send RGBA layers (N, h, w, 4) of `kind` `solved` or `flat` and, if known, relief (h, w) as 16-bit floats."""
         data = await asyncio.to_thread(lambda: layers.tobytes() + (b"" if relief is None else half_floats(relief)))
-        message = {"layers": kind, "solved_for_m": solved_for_m, "size": layers.shape[2:0:-1]}
+        message = {"layers": kind, "solved_for": solved_for, "size": layers.shape[2:0:-1]}
         await self._say(message if relief is None else message | {"relief": relief.shape[::-1]})
         await self._socket.send_bytes(data)
 
     async def _send_moment(self, moment: Any) -> None:
-        """Send a measured refresh's layers and both eyes' target pictures, all as RGBA."""
+        """Send a measured refresh's layers and each eye's target picture, all as RGBA."""
         views = moment.eye_views
 
         def packed() -> bytes:
-            pictures = [*moment.layers, *(as_codes(intensities(picture)) for picture in views.wanted[:2])]
+            pictures = [*moment.layers, *(as_codes(intensities(picture)) for picture in views.wanted)]
             return b"".join(cv2.cvtColor(p[..., :3], cv2.COLOR_RGB2RGBA).tobytes() for p in pictures)
 
+        numbers = [person.number for person in moment.account.people if person.solved_for_m is not None]
+        eyes_m = views.eyes_m.reshape(-1, 2, 3)
+        solved_for = [{"number": n, "eyes_m": pair} for n, pair in zip(numbers, eyes_m, strict=True)]
         self._moment, self._under_way = moment, True
         data = await asyncio.to_thread(packed)
         height, width = views.wanted[0].shape[:2]
         size = [moment.layers.shape[2], moment.layers.shape[1]]
-        message = {"layers": "solved", "solved_for_m": views.eyes_m[:2], "size": size, "target": [width, height]}
-        await self._say(message | {"frame": moment.account.frame})
+        message = {"layers": "solved", "solved_for": solved_for, "size": size}
+        await self._say(message | {"target": [width, height], "frame": moment.account.frame})
         await self._socket.send_bytes(data)
 
     async def receive(self, me: object) -> None:
@@ -116,7 +121,7 @@ class _Page:
             if given["type"] == "websocket.disconnect":
                 raise WebSocketDisconnect(given.get("code", 1000))
             if given.get("bytes") is not None:
-                if self._link.is_viewer(me) and self._link.mode.is_camera:
+                if self._link.is_camera(me) and self._link.mode.is_camera:
                     self._link.send_picture(given["bytes"], picture_ms)
                 continue
             message = json.loads(given["text"])
@@ -129,12 +134,13 @@ class _Page:
             if message.get("drawn"):
                 self._under_way = False
                 self.news.set()
-            if "eyes" in message and self._link.is_viewer(me) and self._link.mode.is_sensor:
+            if "eyes" in message and (head := self._link.head_of(me)) is not None:
                 with contextlib.suppress(ValueError, TypeError):
-                    self._link.see(message["eyes"], float(message.get("page_ms", 0.0)))
+                    page_ms = float(message.get("page_ms", 0.0))
+                    self._link.see(message["eyes"], page_ms, head, message.get("velocity_m_s"))
             for name, (least, most) in RANGES.items():
                 value = _number(message.get(name), None)
-                if value is None or (name == "camera" and not self._link.is_viewer(me)):
+                if value is None or (name == "camera" and not self._link.is_camera(me)):
                     continue
                 if not least <= value <= most:
                     continue

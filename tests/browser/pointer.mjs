@@ -22,7 +22,7 @@ await page.addInitScript(() => {
     }
     send.call(this, data);
     if (data === '{"drawn":true}' && asked?.layers === "solved") {
-      const { solved_for_m: eyes } = asked;
+      const [{ eyes_m: eyes } = {}] = asked.solved_for;
       next().then(next).then((ms) => eyes && seen.shown.push({ eyes, ms }));
     }
   };

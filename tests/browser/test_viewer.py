@@ -79,11 +79,14 @@ STACKS = (
 )
 
 
+@pytest.mark.parametrize("people", [1, 2])
 @pytest.mark.parametrize("stack", STACKS, ids=lambda stack: f"{stack.count} panels")
-def test_the_page_aligns_as_the_runtime_does_to_its_limits(stack: PanelStack) -> None:
+def test_the_page_aligns_as_the_runtime_does_to_its_limits(stack: PanelStack, people: int) -> None:
     random = np.random.default_rng(3)
-    old = [eyes_at(distance_m=d, angle_deg=a, height_m=0.1) for d, a in random.uniform((0.3, -40), (1.2, 40), (40, 2))]
-    moves = random.normal(size=(40, 3)) * np.geomspace(1e-2, 100, 40)[:, None]
+    places = random.uniform((0.3, -40), (1.2, 40), (40, people, 2))
+    old = [np.concatenate([eyes_at(distance_m=d, angle_deg=a, height_m=0.1) for d, a in each]) for each in places]
+    moves = random.normal(size=(40, 1, 3)) * np.geomspace(1e-2, 100, 40)[:, None, None]
+    moves = np.repeat(moves * random.uniform(0.5, 1.5, (40, people, 1)), 2, axis=1)
     now = [eyes + move for eyes, move in zip(old, moves, strict=True)]
     cases = [[a.tolist(), b.tolist()] for a, b in zip(old, now, strict=True)]
     table = json.loads(json.dumps(stack_table(stack)))

@@ -16,7 +16,7 @@ export const apply = (m, x, y) => {
   const w = m[6] * x + m[7] * y + m[8];
   return [(m[0] * x + m[1] * y + m[2]) / w, (m[3] * x + m[4] * y + m[5]) / w];
 };
-export const middle = (eyes) => eyes[0].map((v, k) => (v + eyes[1][k]) / 2);
+export const middle = (eyes) => eyes[0].map((_, k) => eyes.reduce((sum, eye) => sum + eye[k], 0) / eyes.length);
 export const moved = (eyes, by) => eyes.map((eye) => eye.map((v, k) => v + by[k]));
 export const centre = (stack) => stack.x_m[stack.x_m.length >> 1];
 const dot = (a, b) => a.reduce((sum, v, k) => sum + v * b[k], 0);
@@ -92,11 +92,22 @@ export function panelFromPicture(stack, n, eye, picture, nominal = eye) {
   return mul(pixels(stack), seen ? mul(seen, ideal) : ideal);
 }
 
-// Return the alignment of solved layers to other eyes. Twin of align in runtime/optics/alignment.py.
+// Return the movement that several people share. Twin of common_movement_m in runtime/optics/alignment.py.
+function common(before, after) {
+  const both = (eyes, n) => middle([eyes[n - 1], eyes[n]]);
+  const steps = before.flatMap((_, n) => (n % 2 ? [both(after, n).map((v, k) => v - both(before, n)[k])] : []));
+  return [0, 1, 2].map((k) => {
+    const along = steps.map((step) => step[k]), least = Math.min(...along), most = Math.max(...along);
+    return least > 0 ? least : most < 0 ? most : 0;
+  });
+}
+
+// Return the alignment of solved layers to other eyes of the same people. Twin of align in runtime/optics/alignment.py.
 // maps: for each panel, [scale u, scale v, shift u, shift v] from shown pixels to pixels of the solution.
 // parallax: how content that is not on the middle panel moves.
 // limited: why the alignment reaches its limit before the eyes, or empty if it does not.
 export function alignment(stack, solved, eyes) {
+  if (eyes.length > 2) eyes = moved(solved, common(solved, eyes));
   const old = middle(solved), now = middle(eyes), step = now.map((v, k) => v - old[k]), r = reference(stack);
   let share = 1, limited = "";
   const limit = (most, least, why) => {
@@ -571,11 +582,11 @@ export class Display {
   }
 }
 
-// Draw a plan of eyes and panels in an SVG element, seen from above (axis 1) or from the side (axis 2). The x axis,
+// Draw a plan of people's eyes and panels in an SVG element, seen from above (axis 1) or from the side (axis 2). The x axis,
 // which points towards the viewer, points right in the plan.
 export function drawPlan(svg, { stack, eyes, axis, range = null, sigma_m = 0, solved = null, far_m = 1 }) {
   const size_m = axis === 1 ? stack.width_m : stack.height_m;
-  const far = Math.max(far_m, eyes ? 1.15 * Math.max(eyes[0][0], eyes[1][0]) : 0);
+  const far = Math.max(far_m, ...(eyes ?? []).map(([x]) => 1.15 * x));
   const wide = Math.max(size_m / 2, ...[...(eyes ?? []), ...(solved ?? [])].map((eye) => Math.abs(eye[axis])));
   const scale = Math.min(300 / (far + 0.15), 78 / wide);
   const at = (x, across) => [10 + (x + 0.15) * scale, 85 - across * scale], shapes = [];
@@ -595,7 +606,7 @@ export function drawPlan(svg, { stack, eyes, axis, range = null, sigma_m = 0, so
     add("circle", { cx, cy, r: 4.5, class: "solved" });
   }
   eyes?.forEach((eye, index) => {
-    const side = index ? "right" : "left", place = [eye[0], eye[axis]], [cx, cy] = at(...place);
+    const side = index % 2 ? "right" : "left", place = [eye[0], eye[axis]], [cx, cy] = at(...place);
     for (const edge of [-size_m / 2, size_m / 2]) line(place, [stack.x_m[0], edge], `ray ${side}`);
     add("circle", { cx, cy, r: Math.max(sigma_m * scale, 0.1), class: `sure ${side}` });
     add("circle", { cx, cy, r: 3.5, class: side });

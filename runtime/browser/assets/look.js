@@ -61,7 +61,8 @@ export class Look {
     Object.assign(this, { mode: "parallel", head: [0, 0, 0], aligned: true, pupil: false, focus_mm: 0, point: [0, 0], rays: 3, coarse: 1, frame_ms: 0, painted_ms: 0, reported_ms: 0, frames: 0 });
     if (this.display.software) Object.assign(this, SOFTWARE);
     this.flatness = 0;
-    this.used = null; // eyes that the panels are aligned to; null: the true eyes
+    this.between = null; // all people's eyes that the layers were solved for, and that they are aligned to; null: `eyes`
+    this.others = []; // eyes of the people whose pictures are not drawn
     this.state = ""; // why the picture differs from what the two eyes should see
     this.live = false; // true if the daemon measures the light, and calls `tell`
     this.onhead = () => {}; // called after the head has moved
@@ -85,7 +86,7 @@ export class Look {
 
   get alignment() {
     if (!this.aligned || !this.scene.eyes_m) return unaligned(this.stack);
-    return alignment(this.stack, this.scene.eyes_m, this.used ?? this.eyes);
+    return alignment(this.stack, ...(this.between ?? [this.scene.eyes_m, this.eyes]));
   }
 
   // Change the panels' positions. Layers for the new positions are loaded later.
@@ -314,7 +315,7 @@ export class Look {
   #report(limited) {
     const { eyes_m: solved } = this.scene, eyes = this.eyes;
     for (const svg of this.$(".views").querySelectorAll("svg"))
-      drawPlan(svg, { stack: this.stack, eyes, solved, axis: Number(svg.dataset.axis), far_m: 0.7, sigma_m: this.sigma_m ?? 0 });
+      drawPlan(svg, { stack: this.stack, eyes: [...eyes, ...this.others], solved, axis: Number(svg.dataset.axis), far_m: 0.7, sigma_m: this.sigma_m ?? 0 });
     if (this.mode !== "apart") this.$(".point").replaceChildren();
     const [x, y, z] = solved ? middle(eyes).map((v, k) => v - middle(solved)[k]) : [0, 0, 0];
     const parts = [[y, "to the right", "to the left"], [z, "up", "down"], [x, "farther", "nearer"]].filter(([v]) => mm(v));

@@ -1,4 +1,4 @@
-// Script for the live display, which shows the panels. The pointer acts as the head seen by the daemon's sensor.
+// Script for the live display, which shows the panels. The pointer acts as a head seen by the daemon's sensor.
 import { Look } from "/look.js";
 import { Choice, MORE, effortInWords, modelsOf, scenesOf } from "/choice.js";
 import { ask, token } from "/session.js";
@@ -6,11 +6,14 @@ import { ask, token } from "/session.js";
 // AGAIN_MS: how often a resting head's position is sent again.
 // KEPT: number of latencies used for statistics.
 const AGAIN_MS = 500, STATUS_MS = 500, RETRY_MS = 1000, KEPT = 600;
-const PLACE_M = [0.6, 0, 0];
+// PLACES_M: where each head starts.
+const PLACES_M = [[0.6, 0, 0], [0.6, 0.28, 0]];
 // A quick head's peak acceleration, the duration of its shortest movement, and the time between samples.
 const PEAK_M_S2 = 12, LEAST_S = 0.1, STEP_MS = 12;
 const FIRST = `
-<form><label>Scene <select name="scene"></select></label>
+<p class="who" role="status"></p>
+<form><label hidden>Seen by <select name="seen_by"></select></label>
+<label>Scene <select name="scene"></select></label>
 <label>File or folder <input type="text" name="scene_file" autocomplete="off" placeholder="/home/me/model.glb"></label>
 <label>Model <select name="model"></select></label>
 <label>ONNX file <input type="text" name="model_file" autocomplete="off" placeholder="/home/me/model.onnx"></label>
@@ -29,7 +32,10 @@ const CONTROLS = `
 <label class="tick"><input type="checkbox" name="lost"> hide the viewer's eyes, as if the viewer had left</label></form>
 <p><a href="/operator">Open the operator's page</a></p>`;
 
-let look = null, socket = null, viewer = false, sensor = true, lastSent = 0, follows = null, ipd_m = 0.063, newest = null, pending = null;
+let look = null, socket = null, mode = {}, lastSent = 0, ipd_m = 0.063, newest = null, pending = null;
+// me: number of the head that this page moves, or null. people: those served, with their eyes. solved: people that the
+// loaded layers were solved for. seenBy: whose picture is shown (`idOf`); null: this page's own.
+let me = null, people = [], solved = [], seenBy = null;
 let checks = false, camera = null, lookedAt = null;
 // wishes: number of commands in progress. answered_ms: when the last command ended.
 // measured: number of the measured refresh whose target pictures are loaded.
@@ -41,14 +47,18 @@ const main = document.querySelector("main");
 
 // Positions of both eyes of a head that faces the display's centre.
 function eyesOf(head) {
-  const at = PLACE_M.map((v, k) => v + head[k]), norm = Math.hypot(at[0], at[1]);
+  const at = PLACES_M[me ?? 0].map((v, k) => v + head[k]), norm = Math.hypot(at[0], at[1]);
   const right = [-at[1] / norm, at[0] / norm, 0];
   return [-0.5, 0.5].map((side) => at.map((v, k) => v + side * ipd_m * right[k]));
 }
 
-// The true eyes if this page's pointer is the head. If not, the eyes last measured by the daemon for another page or a
+const own = () => (me === null ? people[0] : people.find((person) => person.head === me));
+const seen = () => people.find((person) => idOf(person) === seenBy) ?? own();
+const idOf = ({ head, number }) => head ?? number - 1; // stays the same if a head that was lost comes back as a new person
+
+// The true eyes if this page's pointer moves them. If not, the eyes last measured by the daemon for another page or a
 // camera.
-const eyesNow = (head) => (viewer && sensor ? eyesOf(head) : newest?.eyes_m ?? follows ?? eyesOf([0, 0, 0]));
+const eyesNow = (head) => (me === null || seen() !== own() ? seen()?.eyes_m ?? eyesOf([0, 0, 0]) : eyesOf(head));
 const say = (message) => { if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message)); };
 
 // The head follows the pointer along a minimum-jerk path, which is replanned whenever the pointer moves. Otherwise, if
@@ -82,10 +92,10 @@ function go() {
 }
 
 function see() {
-  if (!look || !viewer || !sensor) return;
+  if (!look || me === null) return;
   lastSent = performance.now();
-  const gone = document.hidden || form("lost").checked;
-  say({ eyes: gone ? null : eyesOf(head()), page_ms: lastSent });
+  const gone = document.hidden || form("lost").checked, moving = motion(lastSent), velocity_m_s = moving.map(([, v]) => v);
+  say({ eyes: gone ? null : eyesOf(moving.map(([place]) => place)), velocity_m_s: step === null ? null : velocity_m_s, page_ms: lastSent });
 }
 
 const form = (name) => main.querySelector(`[name=${name}]`);
@@ -150,6 +160,12 @@ function build({ stack, fov_deg }) {
   form("turntable").addEventListener("change", (event) => wish("place", { turntable_per_min: Number(event.target.value) }));
   form("held").addEventListener("change", (event) => wish(event.target.checked ? "pause" : "resume"));
   form("lost").addEventListener("change", see);
+  form("seen_by").addEventListener("change", (event) => {
+    seenBy = Number(event.target.value);
+    settle();
+    if (checks) say({ checks }); // the target pictures are sent again
+    look.draw();
+  });
   form("camera").addEventListener("change", (event) => film(event.target.checked));
   for (const each of main.querySelectorAll("form")) each.addEventListener("submit", (event) => event.preventDefault());
   look.onframe = painted;
@@ -225,14 +241,41 @@ function painted() {
   }
 }
 
-function take({ refresh, viewer: mine }) {
-  const before = newest;
-  [newest, viewer] = [refresh, mine];
+// Relate the loaded layers to the people who are served now. Twin of matched in runtime/frame/served.py.
+function settle() {
+  const now = seen(), both = solved.flatMap((then) => people.filter(({ number }) => number === then.number).map((one) => [then, one]));
+  if (!both.length && solved.length && people.length) both.push([solved[0], people[0]]);
+  look.between = both.length ? [0, 1].map((k) => both.flatMap((pair) => pair[k].eyes_m)) : null;
+  look.scene.eyes_m = (solved.find(({ number }) => number === now?.number) ?? solved[0])?.eyes_m ?? look.scene.eyes_m;
+  look.others = people.filter((one) => one !== now).flatMap((one) => one.eyes_m);
+}
+
+// Tell which person this page is, and offer the pictures of all.
+function introduce() {
+  const { stack: { x_m }, heads, is_sensor } = mode, list = form("seen_by");
+  const panels = `${x_m.length} panels serve one person`, more = x_m.length < 4 ? "With four panels or tracker.viewers = 2" : "With tracker.viewers = 2";
+  const text = !is_sensor ? "" : me === null ? (heads > 1 ? "This page only watches, because two other pages are the two people." : `This page only watches, because ${panels}. ${more}, a second page is a second person.`) :
+    heads < 2 ? "" : !own() ? "You are not served yet." : `You are person ${me + 1}.${people.length < 2 ? " Open this page in a second window as well, and it is a second person." : ""}`;
+  const who = main.querySelector(".who");
+  if (who.textContent !== text) who.textContent = text;
+  look.$(".how").hidden = me === null;
+  list.parentElement.hidden = people.length < 2;
+  const names = people.map((one) => [idOf(one), me !== null && one === own() ? "me" : `person ${idOf(one) + 1}`]).sort();
+  if (list.dataset.key !== (list.dataset.key = JSON.stringify(names))) list.replaceChildren(...names.map(([value, name]) => new Option(name, value)));
+  list.value = seen() ? idOf(seen()) : "";
+}
+
+function take({ refresh, head, page_ms }) {
+  const before = newest, moved = me !== head;
+  [newest, me] = [{ ...refresh, page_ms }, head];
   if (!look || !refresh.state) return;
-  look.used = refresh.eyes_m ?? look.used;
+  if (refresh.people.length) people = refresh.people;
+  settle();
+  introduce();
+  if (moved) see();
   look.sigma_m = (refresh.eye_sigma_mm ?? 0) / 1000;
   const flatness = checks ? 0 : layersSeen.solved ? (layersSeen.flat ? refresh.flatness : 0) : 1;
-  const same = before && look.flatness === flatness && JSON.stringify(before.eyes_m) === JSON.stringify(refresh.eyes_m);
+  const same = before && look.flatness === flatness && JSON.stringify(before.people) === JSON.stringify(refresh.people);
   look.flatness = flatness;
   const state = refresh.state === "tracking" ? (checks ? age(refresh) : "") : explained(refresh), told = state === look.state;
   look.state = state;
@@ -266,20 +309,20 @@ function explained({ state, reason }) {
 }
 
 function load(bytes) {
-  const { layers: kind, solved_for_m, target, relief, frame, size: [w, h] } = pending, size = 4 * w * h * look.stack.x_m.length;
+  const { layers: kind, solved_for, target, relief, frame, size: [w, h] } = pending, size = 4 * w * h * look.stack.x_m.length;
+  if (kind === "solved") solved = solved_for, settle();
   look.display.load(kind, new Uint8Array(bytes, 0, size), [w, h]);
   if (kind === "solved") look.display.unfold(relief ? new Uint16Array(bytes, size, relief[0] * relief[1]) : null, relief);
   if (target) {
-    const [width, height] = target, length = 4 * width * height;
+    const [width, height] = target, length = 4 * width * height, person = Math.max(0, solved.findIndex(({ number }) => number === seen()?.number));
     look.scene.picture = { width, height };
     for (const side of [0, 1])
-      look.display.target(side, new ImageData(new Uint8ClampedArray(bytes, size + side * length, length), width, height));
+      look.display.target(side, new ImageData(new Uint8ClampedArray(bytes, size + (2 * person + side) * length, length), width, height));
   }
   if (target) measured = frame;
   layersSeen[kind] = true;
   if (kind === "solved" && restarting?.begun) restarting = null;
   if (kind === "solved" && (target || !checks) && !restarting) look.notice("");
-  if (kind === "solved") look.scene.eyes_m = solved_for_m ?? look.scene.eyes_m;
   look.draw();
   say({ drawn: true });
 }
@@ -295,14 +338,13 @@ function connect() {
       layersSeen = { solved: false, flat: false };
       if (restarting) restarting.begun = true;
       measured = null;
-      sensor = message.is_sensor;
+      [mode, people, solved, seenBy] = [message, [], [], null];
       const same = look && ["width_px", "height_px"].every((k) => look.stack[k] === message.stack[k]) && look.stack.x_m.length === message.stack.x_m.length;
       if (same) look.turnTo(message.stack), look.notice(restarting?.text ?? "Solving the first picture …");
       else build(message);
-      look.$(".how").hidden = !sensor;
       form("camera").checked = message.is_camera;
-      form("camera_fov_deg").parentElement.hidden = sensor;
-      if (sensor) main.querySelector(".found").hidden = true;
+      form("camera_fov_deg").parentElement.hidden = mode.is_sensor;
+      if (mode.is_sensor) main.querySelector(".found").hidden = true;
       form("gap_mm").value = used.gap_mm = Math.round(1e5 * (message.stack.x_m[1] - message.stack.x_m[0])) / 100;
       if (checks) say({ checks });
     } else if (message.found) found(message.found);
@@ -336,12 +378,13 @@ async function about() {
 function figures(now, asked_ms) {
   const at = (share) => [...latencies].sort((a, b) => a - b)[Math.floor(share * (latencies.length - 1))];
   const rests = now.eyes_label === "rested", solves = now.solutions_per_s_now > 0;
+  const { view_error_estimated_mm: error_mm } = now.people.find(({ number }) => number === seen()?.number) ?? {};
   const rows = { // any row without a value is omitted
     "page": drawn.length > 1 && `${drawn.length} pictures per second`,
     "panels": now.fps_now > 0 && `${number(now.fps_now)} refreshes per second`,
     "solver": solves ? `${number(now.solutions_per_s_now)} solutions per second (${now.model})` : now.paused ? "paused" : rests && "idle while the head rests",
     "effort": solves && now.effort && effortInWords(now.effort),
-    "estimated view error": solves && typeof now.view_error_estimated_now_mm === "number" && `${number(now.view_error_estimated_now_mm)} mm`,
+    "estimated view error": solves && typeof error_mm === "number" && `${number(error_mm)} mm`,
     "solution age": solves && `${number(now.solution_age_now_ms, 0)} ms`,
     "uncertainty of the eyes": typeof now.eye_sigma_now_mm === "number" && `${number(now.eye_sigma_now_mm, 2)} mm (${now.eyes_label})`,
     "delay between pointer and picture": latencies.length > 20 && `${number(at(0.5), 0)} ms median, 99% within ${number(at(0.99), 0)} ms`,

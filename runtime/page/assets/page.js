@@ -97,7 +97,7 @@ function plot(status) {
 
 function view(svg, status, axis, range) {
   const sigma_m = ((status.eye_sigma_now_mm ?? 0) / 1000) * ZOOMED_SIGMAS;
-  drawPlan(svg, { stack: about.stack, eyes: status.eyes_m, axis, range, sigma_m, far_m: Math.max(1.0, 1.15 * (about.viewing_m?.[1] ?? 0.6)) });
+  drawPlan(svg, { stack: about.stack, eyes: status.people?.length ? status.people.flatMap((person) => person.eyes_m) : status.eyes_m, axis, range, sigma_m, far_m: Math.max(1.0, 1.15 * (about.viewing_m?.[1] ?? 0.6)) });
 }
 
 function sector(low_deg, high_deg) {
