@@ -300,4 +300,7 @@ def _rgb(frame: av.VideoFrame, background: Colour) -> U8:
         picture = np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
     if frame.color_trc in BRIGHT:
         picture = srgb_from(picture, primaries=frame.color_primaries, transfer=frame.color_trc)
-    return np.ascontiguousarray(np.rot90(picture, round(frame.rotation / 90) % 4))
+    matrix = next((bytes(item) for item in cast(Any, frame.side_data) if item.type.name == "DISPLAYMATRIX"), bytes(36))
+    a, b, c, d = struct.unpack_from("<2i4x2i", matrix)
+    upright = picture[::-1] if a * d < b * c else picture  # mirrored, as some phones record their front camera
+    return np.ascontiguousarray(np.rot90(upright, round(frame.rotation / 90) % 4))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -106,6 +107,27 @@ def test_frames_are_those_of_their_number_in_any_order(tmp_path: Path, name: str
     frames = open_frames(path, AUTO)
     order = [*range(11), 8, 3, 10, 1, 6]
     assert [round((float(frames.frame(n).mean()) - 20) / 20) for n in order] == order
+
+
+@pytest.mark.parametrize(
+    ("matrix", "wanted"),
+    [((1, 0, 0, 1), "1234"), ((-1, 0, 0, 1), "2143"), ((1, 0, 0, -1), "3412"), ((-1, 0, 0, -1), "4321"),
+     ((0, 1, -1, 0), "3142"), ((0, 1, 1, 0), "1324"), ((0, -1, 1, 0), "2413"), ((0, -1, -1, 0), "4231")],
+)  # fmt: skip
+def test_a_film_is_turned_and_mirrored_as_it_declares(tmp_path: Path, matrix: tuple[int, ...], wanted: str) -> None:
+    """A point x, y from the middle is shown at a x + c y, b x + d y."""
+    quarters = np.kron(np.array([[1, 2], [3, 4]]) * 50, np.ones((24, 32)))
+    path = write(tmp_path / "a.mp4", [(0, np.repeat(quarters[..., None], 3, 2).astype(np.uint8))])
+    plain, own = (
+        struct.pack(">9i", *(n << 16 for n in (a, b, 0, c, d, 0, 0, 0)), 1 << 30)
+        for a, b, c, d in ((1, 0, 0, 1), matrix)
+    )
+    data = path.read_bytes()
+    place = data.rindex(plain)  # the film's own comes before that of its track
+    path.write_bytes(data[:place] + own + data[place + len(own) :])
+    picture = open_frames(path, AUTO).frame(0)
+    places = [(y, x) for y in (picture.shape[0] // 4, -12) for x in (picture.shape[1] // 4, -12)]
+    assert "".join(str(round(picture[place].mean() / 50)) for place in places) == wanted
 
 
 @pytest.mark.parametrize("step_ms", [20_000, 100_000])
