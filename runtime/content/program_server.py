@@ -147,6 +147,7 @@ class _Client:
         self._depth: np.dtype[Any] | None = None if depth is None else DEPTHS[depth]
         self._shares_memory, self._frames_shared = hello.get("memory", False), 0
         self._memory: _Memory | None = None
+        self.unasked = 0  # consecutive pictures for an eye that was not asked for
         self._messages: deque[str] = deque(maxlen=1 if self.listens else 2 * IN_FLIGHT_MAX)
         self._has_messages = asyncio.Event()
 
@@ -383,12 +384,16 @@ class ProgramServer:
         if not isinstance(message, bytes) or len(message) < HEAD.size:
             raise ValueError("the answer is not a picture")
         number, side = HEAD.unpack_from(message)
-        if side >= len(SIDES):
-            raise ValueError(f"the answer is for eye {side}; the left eye is 0 and the right eye is 1")
         with self._changed:
             frame = self._frames.get(number)
-            if client is not self._drawing or frame is None or side not in frame.asked.sides:
-                return  # the frame was abandoned
+        is_asked = frame is None or side in frame.asked.sides
+        client.unasked = (
+            0 if is_asked else client.unasked + 1
+        )  # once: a program may draw both eyes, the right one first
+        if side >= len(SIDES) or client.unasked > 1:
+            raise ValueError(f"the answer is for eye {side}; the left eye is 0 and the right eye is 1")
+        if client is not self._drawing or frame is None or not is_asked:
+            return  # the frame was abandoned
         data = memoryview(message)[HEAD.size :]
         in_memory = not data and side in frame.places
         frame.pictures[side] = frame.form.picture(*frame.places[side]) if in_memory else frame.form.received(data)

@@ -241,6 +241,22 @@ def test_a_picture_that_was_not_asked_for_is_left(source: Any) -> None:
     program.end()
 
 
+def test_eyes_numbered_from_one_are_told_while_one_eye_is_asked_for(source: Any) -> None:
+    """Of one eye, 1 instead of 0 is no number that cannot be."""
+    view = raster_views(EYES, STACK.panel(0))[0]
+    with connect(source.program["address"], max_size=None, compression=None) as socket:
+        socket.send(json.dumps({"name": "test"}))
+        time.sleep(0.1)
+        with pytest.raises(ConnectionClosed) as told:
+            for _ in range(4):
+                with suppress(ContentFailure):
+                    source.expect([view], time_ns=0)
+                socket.send(struct.pack("<II", json.loads(socket.recv(10))["frame"], 1) + bytes(4 * 64 * 36))
+    assert told.value.rcvd is not None and told.value.rcvd.reason == (
+        "the answer is for eye 1; the left eye is 0 and the right eye is 1"
+    )
+
+
 class Silent:
     """A client that has a small buffer and reads only when it is told to."""
 
