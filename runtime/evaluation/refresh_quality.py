@@ -76,7 +76,8 @@ def measure_refresh(
 ) -> RefreshQuality:
     """Measure a refresh's quality for all targets that were drawn, unless the eyes see no part of the
     panels. `carried` are the layers aligned as if all content were on the middle panel, and those before alignment;
-    None if more than a solution was shown. `quick` measures only the light at the aligned eyes, on fewer pixels.
+    None if more than a solution was shown. `quick` measures only the light at the aligned eyes, on fewer pixels, against
+    what these eyes should see.
     """
     errors = _live_errors(account, layers, targets, stack)
     error = float(np.mean(list(errors.values()))) if errors else None
@@ -146,11 +147,13 @@ def _at_aligned_eyes(
     unseen = EyeViews((), targets.used, Quality(math.nan, math.nan, ()), stack, eyes_m, fov_deg)
     views = unseen if quick else displayed(layers, targets.used, stack, eyes_m=eyes_m, fov_deg=fov_deg)
     thorough = ALIGNED_LARGE if targets.solved[0].size > PLENTY else ALIGNED
+    # A live page compares what the panels show with what these eyes should see; reprojected content may be torn.
+    shown, drawn, drawn_for_m = (layers, targets.used, eyes_m) if quick else (aligned, targets.solved, solved_for_m)
     light = expected_psnrs_db(
-        aligned,
-        targets.solved,
+        shown,
+        drawn,
         stack,
-        eyes_m=solved_for_m,
+        eyes_m=drawn_for_m,
         seen_from_m=eyes_m,
         sigmas_mm=(TRACKING_SIGMA_MM,),
         fov_deg=fov_deg,

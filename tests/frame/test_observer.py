@@ -527,6 +527,25 @@ def test_a_live_figure_applies_until_either_of_two_people_moves(content: Content
     assert light(EYES) is None
 
 
+def test_a_live_figure_falls_where_depth_is_seen_from_elsewhere(content: ContentSource, solved: Solution) -> None:
+    observer, _ = looking(content, simulated=False, newest=True)
+    numbers = count(1)
+
+    def light_db(eyes_m: Any) -> float:
+        found: list[float] = []
+
+        def is_measured() -> bool:
+            shown = refresh(next(numbers), solved, eyes_m=eyes_m)
+            observer.refreshed(shown)
+            found.append(observer.light(shown)["light_db"])
+            return found[-1] is not None
+
+        assert eventually(is_measured)
+        return found[-1]
+
+    assert light_db(EYES) - light_db(aside(0.15)) > 5
+
+
 def test_a_live_figure_has_an_age_and_follows_a_better_solution(content: ContentSource, solved: Solution) -> None:
     observer, _ = looking(content, simulated=False, newest=True)
     numbers = count(1)
