@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import math
 import os
+import sys
 import tempfile
 import time
 import warnings
@@ -167,7 +168,8 @@ class Result:
         """Open a browser page of layers and views, and return its temporary HTML file, which stays."""
         path = Path(tempfile.mkdtemp(prefix="phasestack-")) / "viewer.html"
         path.write_text(self._pair.viewer([self._line, *self.notes]), encoding="utf-8")
-        webbrowser.open(path.as_uri())
+        if not webbrowser.open(path.as_uri()):
+            print(f"no browser could be opened; open {path.as_uri()}", file=sys.stderr)
         return path
 
     def _repr_html_(self) -> str:
