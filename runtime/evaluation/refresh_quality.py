@@ -76,8 +76,8 @@ def measure_refresh(
 ) -> RefreshQuality:
     """Measure a refresh's quality for all targets that were drawn, unless the eyes see no part of the
     panels. `carried` are the layers aligned as if all content were on the middle panel, and those before alignment;
-    None if more than a solution was shown. `quick` measures only the light at the aligned eyes, on fewer pixels, against
-    what these eyes should see.
+    None if more than a solution was shown. `quick` measures only the light at the aligned eyes, on fewer pixels,
+    against what these eyes should see.
     """
     errors = _live_errors(account, layers, targets, stack)
     error = float(np.mean(list(errors.values()))) if errors else None
