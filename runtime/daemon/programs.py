@@ -8,7 +8,7 @@ import threading
 from importlib import import_module
 from typing import Any
 
-from runtime.support.background import begin
+from runtime.support.background import begin, patience_s
 from runtime.support.channel import Channel
 from runtime.support.process import Parent, Role, Worker
 from runtime.support.untrusted_input import MIB
@@ -16,6 +16,7 @@ from runtime.support.untrusted_input import MIB
 NICENESS = 5  # as the solver, which waits for it
 MEMORY_BYTES = 2048 * MIB  # for unread messages of programs that do not share memory
 ALLOWED_S, LOOK_S = 5.0, 0.25
+ENDS_S = 0.5  # how long the starter gets to end
 
 
 class Programs:
@@ -43,20 +44,19 @@ class Programs:
     def close(self) -> None:
         """End the process, if there is one."""
         self._closing.set()
-        self._starter.join()
+        self._solver_end.close()  # ends the starter's wait, once the solver has ended
+        self._starter.join(patience_s(ENDS_S))
         if self._worker is not None:
             self._worker.close()
-        self._solver_end.close()
         self._server_end.close()
 
     def _start(self) -> None:
         asked, end = select.poll(), self._server_end.fileno()
         asked.register(end, select.POLLIN)
-        while not self._closing.is_set():
-            if asked.poll(1e3 * LOOK_S):
-                role = Role("program server", main, niceness=NICENESS, memory_bytes=MEMORY_BYTES)
-                self._worker = Worker(role, lambda: (end, self._token), files=(end,))
-                return
+        asked.poll()
+        if not self._closing.is_set():
+            role = Role("program server", main, niceness=NICENESS, memory_bytes=MEMORY_BYTES)
+            self._worker = Worker(role, lambda: (end, self._token), files=(end,))
 
 
 def main(parent: Parent, descriptor: int, token: str) -> None:
