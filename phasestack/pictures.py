@@ -75,7 +75,8 @@ def as_array(name: str, given: Any) -> Any:
 def as_numbers(name: str, given: Any, told: str) -> F64:
     """Convert numbers, or tensors on any device, to float64. Raises ValueError, `name` and `told`."""
     try:
-        return np.asarray(_detached(given), np.float64)
+        numbers = np.asarray(_detached(given))
+        return numbers.astype(np.float64, casting="same_kind" if numbers.dtype.kind == "c" else "unsafe")
     except (TypeError, ValueError, RuntimeError):
         raise ValueError(f"{name}: {told}") from None
 

@@ -580,9 +580,10 @@ def test_tensors_that_need_gradients_are_taken_as_numbers() -> None:
     middle = phasestack.project(torch.zeros(3, requires_grad=True), eye_m=eyes[0], **sizes)
     assert middle == pytest.approx([160, 90])
     assert solution(eyes_m=list(eyes)).layers.shape[0] == 3
-    for name, call in (("eye_m", phasestack.camera), ("points_m", phasestack.project)):
-        with pytest.raises(ValueError, match=f"^{name}: must be"):
-            call("abc", **sizes, **({} if name == "eye_m" else {"eye_m": EYES[0]}))  # type: ignore[operator]
+    for given in ("abc", np.full(3, 1j)):
+        for name, call in (("eye_m", phasestack.camera), ("points_m", phasestack.project)):
+            with pytest.raises(ValueError, match=f"^{name}: must be"):
+                call(given, **sizes, **({} if name == "eye_m" else {"eye_m": EYES[0]}))  # type: ignore[operator]
 
 
 @pytest.mark.parametrize(("pairs", "told"), [(None, "^pairs: must be an iterable"), ("ab", r"^pairs\[0\]: must be")])
