@@ -30,7 +30,9 @@ log = logging.getLogger("phasestack.content")
 
 BOMS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 # Options that precede a texture's name in an MTL file, such as `-s 1 1 1`, `-blendu off` or `-imfchan r`.
-OPTIONS = re.compile(r"(?:-[a-zA-Z]+(?:\s+(?:on|off|[rgbmlz]|[-+.\d]+(?:[eE][-+]?\d+)?))*\s+)+")
+OPTIONS = re.compile(
+    r"(?:-[a-zA-Z]+(?:\s+(?:on|off|[rgbmlz]|sRGB|linear|sphere|cube_\w+|[-+.\d]+(?:[eE][-+]?\d+)?)(?=\s))*\s+)+"
+)
 BEHIND_NUMBERS = re.compile(r"^([ \t]*(?:v|vt|vn|vp|f|l|p)[ \t][^#\n]*)#.*", re.MULTILINE)  # comment in an OBJ file
 COLOURED = re.compile(r"^v(?:[ \t]+[^\s#]+){6}", re.MULTILINE)
 UNCOLOURED_VERTEX = re.compile(r"^v(?:[ \t]+[^\s#]+){3}(?=[ \t\r]*$)", re.MULTILINE)
@@ -82,7 +84,7 @@ class FolderResolver(trimesh.resolvers.FilePathResolver):
         """Return the name of a file in the mesh's folder, which may come with MTL options or as a Windows path, or
         None. Raises InputError if the name is an absolute path or leads out of the folder.
         """
-        name = DRIVE.sub("", OPTIONS.sub("", name, count=1).strip().replace("\\", "/"))
+        name = DRIVE.sub("", OPTIONS.sub("", name, count=1).strip().replace("\\ ", " ").replace("\\", "/"))
         within = untrusted_input.path_within_folder(name, source=self._path, field="texture")
         found = untrusted_input.spelled(self._path.parent, within)
         return None if found is None else str(found.relative_to(self._path.parent))

@@ -217,13 +217,14 @@ def with_material(folder: Path, lines: str) -> Path:
     "name",
     [
         ".\\Maps\\Skin.PNG", "maps/skin.png", "C:\\Users\\me\\Skin.png", "-s 1 1 1 Maps/Skin.png",
-        "-clamp on -mm 0 1.5 -bm 1.0 -o 0.1 .\\maps\\SKIN.PNG",
+        "-clamp on -mm 0 1.5 -bm 1.0 -o 0.1 .\\maps\\SKIN.PNG", "-colorspace sRGB -type sphere Maps/Skin.png",
+        "-s 1 1 1 Maps/1 linear\\ skin.png",
     ],
 )  # fmt: skip
 def test_a_texture_is_found_as_windows_and_exporters_write_it(tmp_path: Path, name: str) -> None:
     folder = tmp_path if ":" in name else tmp_path / "Maps"
     folder.mkdir(exist_ok=True)
-    Image.new("RGB", (4, 4), (255, 0, 0)).save(folder / "Skin.png")
+    Image.new("RGB", (4, 4), (255, 0, 0)).save(folder / ("1 linear skin.png" if "linear" in name else "Skin.png"))
     (part,) = load_mesh(with_material(tmp_path, f"map_Kd {name}")).parts
     assert part.picture[0, 0].tolist() == [255, 0, 0, 255]
 
