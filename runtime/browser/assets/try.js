@@ -34,8 +34,8 @@ const CONTROLS = `
 
 let look = null, socket = null, mode = {}, lastSent = 0, ipd_m = 0.063, newest = null, pending = null;
 // me: number of the head that this page moves, or null. people: those served, with their eyes. solved: people that the
-// loaded layers were solved for. seenBy: whose picture is shown (`idOf`); null: this page's own.
-let me = null, people = [], solved = [], seenBy = null;
+// loaded layers were solved for. seenBy: whose picture is shown (`idOf`); null: this page's own. heads: of people, by number.
+let me = null, people = [], solved = [], seenBy = null, heads = {};
 let checks = false, camera = null, lookedAt = null;
 // wishes: number of commands in progress. answered_ms: when the last command ended.
 // measured: number of the measured refresh whose target pictures are loaded.
@@ -52,9 +52,11 @@ function eyesOf(head) {
   return [-0.5, 0.5].map((side) => at.map((v, k) => v + side * ipd_m * right[k]));
 }
 
-const own = () => (me === null ? people[0] : people.find((person) => person.head === me));
+// A person's head, which stays the same if the person is lost and comes back with another number.
+const idOf = ({ number }) => (mode.is_sensor ? heads[number] ?? -1 : number - 1);
+const own = () => (me === null ? people[0] : people.find((person) => idOf(person) === me));
 const seen = () => people.find((person) => idOf(person) === seenBy) ?? own();
-const idOf = ({ head, number }) => head ?? number - 1; // stays the same if a head that was lost comes back as a new person
+const seenAmong = (others) => others.findIndex((one) => seen() && idOf(one) === idOf(seen()));
 
 // The true eyes if this page's pointer moves them. If not, the eyes last measured by the daemon for another page or a
 // camera.
@@ -246,16 +248,16 @@ function settle() {
   const now = seen(), both = solved.flatMap((then) => people.filter(({ number }) => number === then.number).map((one) => [then, one]));
   if (!both.length && solved.length && people.length) both.push([solved[0], people[0]]);
   look.between = both.length ? [0, 1].map((k) => both.flatMap((pair) => pair[k].eyes_m)) : null;
-  look.scene.eyes_m = (solved.find(({ number }) => number === now?.number) ?? solved[0])?.eyes_m ?? look.scene.eyes_m;
+  look.scene.eyes_m = (solved[seenAmong(solved)] ?? solved[0])?.eyes_m ?? look.scene.eyes_m;
   look.others = people.filter((one) => one !== now).flatMap((one) => one.eyes_m);
 }
 
 // Tell which person this page is, and offer the pictures of all.
 function introduce() {
-  const { stack: { x_m }, heads, is_sensor } = mode, list = form("seen_by");
+  const { stack: { x_m }, is_sensor } = mode, list = form("seen_by");
   const panels = `${x_m.length} panels serve one person`, more = x_m.length < 4 ? "With four panels or tracker.viewers = 2" : "With tracker.viewers = 2";
-  const text = !is_sensor ? "" : me === null ? (heads > 1 ? "This page only watches, because two other pages are the two people." : `This page only watches, because ${panels}. ${more}, a second page is a second person.`) :
-    heads < 2 ? "" : !own() ? "You are not served yet." : `You are person ${me + 1}.${people.length < 2 ? " Open this page in a second window as well, and it is a second person." : ""}`;
+  const text = !is_sensor ? "" : me === null ? (mode.heads > 1 ? "This page only watches, because two other pages are the two people." : `This page only watches, because ${panels}. ${more}, a second page is a second person.`) :
+    mode.heads < 2 ? "" : !own() ? "You are not served yet." : `You are person ${me + 1}.${me === 0 && people.length < 2 ? " Open this page in a second window as well, and it is a second person." : ""}`;
   const who = main.querySelector(".who");
   if (who.textContent !== text) who.textContent = text;
   look.$(".how").hidden = me === null;
@@ -270,6 +272,7 @@ function take({ refresh, head, page_ms }) {
   [newest, me] = [{ ...refresh, page_ms }, head];
   if (!look || !refresh.state) return;
   if (refresh.people.length) people = refresh.people;
+  for (const one of people) if (one.head !== null) heads[one.number] = one.head;
   settle();
   introduce();
   if (moved) see();
@@ -314,15 +317,15 @@ function load(bytes) {
   look.display.load(kind, new Uint8Array(bytes, 0, size), [w, h]);
   if (kind === "solved") look.display.unfold(relief ? new Uint16Array(bytes, size, relief[0] * relief[1]) : null, relief);
   if (target) {
-    const [width, height] = target, length = 4 * width * height, person = Math.max(0, solved.findIndex(({ number }) => number === seen()?.number));
+    const [width, height] = target, length = 4 * width * height, person = seenAmong(solved);
     look.scene.picture = { width, height };
     for (const side of [0, 1])
-      look.display.target(side, new ImageData(new Uint8ClampedArray(bytes, size + (2 * person + side) * length, length), width, height));
+      look.display.target(side, person < 0 ? null : new ImageData(new Uint8ClampedArray(bytes, size + (2 * person + side) * length, length), width, height));
+    measured = person < 0 ? null : frame;
   }
-  if (target) measured = frame;
   layersSeen[kind] = true;
   if (kind === "solved" && restarting?.begun) restarting = null;
-  if (kind === "solved" && (target || !checks) && !restarting) look.notice("");
+  if (kind === "solved" && (measured !== null || !checks) && !restarting) look.notice("");
   look.draw();
   say({ drawn: true });
 }
@@ -338,7 +341,7 @@ function connect() {
       layersSeen = { solved: false, flat: false };
       if (restarting) restarting.begun = true;
       measured = null;
-      [mode, people, solved, seenBy] = [message, [], [], null];
+      [mode, people, solved, seenBy, heads] = [message, [], [], null, {}];
       const same = look && ["width_px", "height_px"].every((k) => look.stack[k] === message.stack[k]) && look.stack.x_m.length === message.stack.x_m.length;
       if (same) look.turnTo(message.stack), look.notice(restarting?.text ?? "Solving the first picture …");
       else build(message);
