@@ -104,18 +104,13 @@ def _frames(path: Path, place: int, rate_hz: float) -> Iterator[SensorFrame]:
             # Ignore the recorded eyes, and look for them in the pictures again.
             yield frame if frame.colour is None else replace(frame, eyes=None)
     elif kind in VIDEOS:
-        yield from _filmed(path)
+        from runtime.support.film import Film  # PyAV is in an extra
+
+        with closing(Film(path)) as film:
+            for number, (time_ns, frames) in enumerate(film.pictures()):
+                yield SensorFrame(number, time_ns, colour=film.rgb(frames[:1]))
     else:
         yield SensorFrame(place, round(place * NS_PER_S / rate_hz), colour=read_image(path))
-
-
-def _filmed(path: Path) -> Iterator[SensorFrame]:
-    """Yield all frames in a film, with their times in it. Raises InputError if it cannot be decoded."""
-    from runtime.support.film import Film  # PyAV is in an extra
-
-    with closing(Film(path)) as film:
-        for number, (time_ns, frames) in enumerate(film.pictures()):
-            yield SensorFrame(number, time_ns, colour=film.rgb(frames[:1]))
 
 
 class _Overlays:

@@ -212,12 +212,10 @@ def _film_layout(film: Film, settings: ContentSettings, picture: U8) -> Layout:
     if stated.left_out and settings.layout == "auto":
         log.warning("%s: showing the film without %s", path, stated.left_out)
     layout = layout_of(path, settings, stated=stated.layout)
+    if is_pair := stated.views == 2 and settings.layout != "mono":
+        layout = replace(PAIR, span_deg=layout.span_deg, right_first=layout.right_first)
     layout = replace(layout, span_deg=stated.span_deg or layout.span_deg, sample_aspect=stated.pixel_aspect)
-    if stated.views == 2 and settings.layout != "mono":
-        return replace(
-            PAIR, span_deg=layout.span_deg, sample_aspect=layout.sample_aspect, right_first=layout.right_first
-        )
-    if settings.layout == "auto":
+    if settings.layout == "auto" and not is_pair:
         height, width = picture.shape[:2]
         layout = of_film(layout, path, width_px=round(width * stated.pixel_aspect), height_px=height)
         if layout.kind == "mono" and not layout.span_deg and not stated.left_out:

@@ -231,6 +231,7 @@ void use_level(int level) {
 }  // namespace
 
 NB_MODULE(compiled, m) {
+  nb::set_leak_warnings(false);  // PyTorch keeps modules, and what they hold, until the process has ended
   processor_level = levels().front();
   m.attr("INTERFACE") = INTERFACE;
   m.attr("MAX_PANELS") = MAX_PANELS, m.attr("MAX_SETS") = MAX_SETS;
