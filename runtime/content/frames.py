@@ -216,6 +216,7 @@ def _film_layout(film: Film, settings: ContentSettings, picture: U8) -> Layout:
         layout = replace(PAIR, span_deg=layout.span_deg, right_first=layout.right_first)
     layout = replace(layout, span_deg=stated.span_deg or layout.span_deg, sample_aspect=stated.pixel_aspect)
     if settings.layout == "auto" and not is_pair:
+        layout = replace(layout, right_first=layout.right_first or stated.right_first)
         height, width = picture.shape[:2]
         layout = of_film(layout, path, width_px=round(width * stated.pixel_aspect), height_px=height)
         if layout.kind == "mono" and not layout.span_deg and not stated.left_out:

@@ -64,6 +64,7 @@ class FilmHeader:
     left_out: str = ""  # description of a view that is declared but not supported
     pixel_aspect: float = 1.0  # pixel width divided by pixel height
     views: int = 1  # 2 if the left and right view are separate streams
+    right_first: bool = False  # True if the right eye's view comes first
 
 
 class Film:
@@ -270,7 +271,7 @@ def _header(frame: av.VideoFrame, streams: list[Any]) -> FilmHeader:
     stream, items = streams[0], cast(Any, frame.side_data)
     side = {item.type.name: bytes(item) for item in items}
     kind, flags = struct.unpack_from("<ii", side.get("STEREO3D", bytes(8)))
-    layout = "cross-eyed" if STEREO.get(kind) == "side-by-side" and flags & 1 else STEREO.get(kind, "")
+    layout = STEREO.get(kind, "")
     if stream.metadata.get("stereo_mode", "").startswith("anaglyph_cyan"):
         layout = "anaglyph"
     left_out = f"its second view ({UNSEEN[kind - 3]}); convert it to side by side" if 3 <= kind <= 8 else ""
@@ -280,7 +281,7 @@ def _header(frame: av.VideoFrame, streams: list[Any]) -> FilmHeader:
         span_deg = 180 if projection == HALF_EQUIRECTANGULAR or left + right > (1 << 30) else 360
     aspect = float(stream.sample_aspect_ratio or 1) or 1.0
     aspect = aspect if frame.rotation % 180 == 0 else 1 / aspect
-    return FilmHeader(layout, span_deg, left_out, aspect, len(streams))
+    return FilmHeader(layout, span_deg, left_out, aspect, len(streams), right_first=bool(layout and flags & 1))
 
 
 def _progressive(frame: av.VideoFrame) -> Any:

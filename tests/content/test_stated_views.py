@@ -69,9 +69,12 @@ def test_an_mp4_is_laid_out_as_its_tag_says(tmp_path: Path) -> None:
     assert len(views_of(film(tmp_path / "a.mp4", pair(), added=st3d(2)), layout="mono")) == 1
 
 
-@pytest.mark.parametrize(("mode", "seen"), [(1, ["red", "blue"]), (11, ["blue", "red"])])
+@pytest.mark.parametrize(
+    ("mode", "seen"), [(1, ["red", "blue"]), (2, ["blue", "red"]), (3, ["red", "blue"]), (11, ["blue", "red"])]
+)
 def test_a_matroska_film_is_laid_out_as_its_tag_says(tmp_path: Path, mode: int, seen: list[str]) -> None:
-    assert views_of(film(tmp_path / "a.mkv", pair(), mode=mode)) == seen
+    picture = np.concatenate([solid(RED, height=48), solid(BLUE, height=48)]) if mode in (2, 3) else pair()
+    assert views_of(film(tmp_path / "a.mkv", picture, mode=mode)) == seen
 
 
 def test_stated_stereo_that_is_not_shown_is_logged(tmp_path: Path, caplog: Any) -> None:
