@@ -18,7 +18,7 @@ from runtime.sensor.base import Capabilities, DeviceClock, Sensor
 from runtime.support.picture_header import picture_size
 
 AGAIN_NS = NS_PER_S // 30  # the last positions are repeated at this interval, because pages report only movements
-SILENT_NS = 5 * NS_PER_S  # there is no viewer if a page has sent no message for this long
+SILENT_NS = 20 * NS_PER_S  # a head is gone after this time without a message; busy pages are silent for seconds
 AHEAD_NS = NS_PER_S // 20  # a moving head whose page is late is extrapolated for at most this long
 PEAK_M_S2 = 12.0  # peak acceleration of pages' heads
 LEAST_SIGMA_M = 5e-5  # lower limit, so that noise-free samples have a regular covariance

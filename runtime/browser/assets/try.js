@@ -3,6 +3,7 @@ import { Look } from "/look.js";
 import { Choice, MORE, effortInWords, modelsOf, scenesOf } from "/choice.js";
 import { ask, token } from "/session.js";
 
+const MEASURING = "Measuring the current picture …";
 // AGAIN_MS: how often a resting head's position is sent again.
 // KEPT: number of latencies used for statistics.
 const AGAIN_MS = 500, STATUS_MS = 500, RETRY_MS = 1000, KEPT = 600;
@@ -182,7 +183,7 @@ function check(on) {
   checks = on;
   measured = null;
   for (const side of [0, 1]) look.display.target(side, null);
-  look.notice(on ? "Measuring the current picture …" : "");
+  look.notice(on ? MEASURING : "");
   say({ checks });
 }
 
@@ -325,7 +326,7 @@ function load(bytes) {
   }
   layersSeen[kind] = true;
   if (kind === "solved" && restarting?.begun) restarting = null;
-  if (kind === "solved" && (measured !== null || !checks) && !restarting) look.notice("");
+  if (kind === "solved" && !restarting) look.notice(checks && measured === null ? MEASURING : "");
   look.draw();
   say({ drawn: true });
 }
