@@ -1,4 +1,7 @@
-"""Serve a live page's WebSocket. The page sends eye positions and receives layers and refreshes."""
+"""Serve a live page's WebSocket. The page sends eye positions and receives layers and refreshes.
+
+Each is sent once the page has dealt with the previous one, so that a slow page shows the present.
+"""
 
 from __future__ import annotations
 
@@ -48,12 +51,13 @@ def _tell(loop: asyncio.AbstractEventLoop, news: asyncio.Event) -> None:
 
 
 class _Page:
-    """Sends data to one page, new layers only after it has drawn the previous ones, and receives its messages."""
+    """Sends data to one page, and receives its messages."""
 
     def __init__(self, socket: WebSocket, link: BrowserLink) -> None:
         self._socket, self._link = socket, link
         self.news, self._sent = asyncio.Event(), {"solved": 0, "flat": 0}
         self._under_way = False  # True while the page has not drawn the latest layers
+        self._unheard = False  # True while the page has not received the latest refresh
         self._mode: PageMode | None = None
         self._checks, self._moment = False, None  # _checks: send the latest measured refresh, not the live one
 
@@ -76,9 +80,9 @@ class _Page:
                 ):
                     if layers is not None and version != self._sent[kind] and not self._under_way:
                         self._sent[kind], self._under_way = version, True
-                        await self._send_layers(kind, layers, relief, shown.told.get("solved_for"))
-            if shown.told is not told:
-                told = shown.told
+                        await self._send_layers(kind, layers, relief, shown.told)
+            if shown.told is not told and not self._unheard:
+                told, self._unheard = shown.told, True
                 head = link.head_of(me)
                 page_ms = link.page_ms_of(told.get("capture_ns", 0), head or 0)
                 await self._say({"refresh": told, "head": head, "page_ms": page_ms})
@@ -88,10 +92,11 @@ class _Page:
             await self.news.wait()
             self.news.clear()
 
-    async def _send_layers(self, kind: str, layers: U8, relief: F32 | None, solved_for: Any) -> None:
+    async def _send_layers(self, kind: str, layers: U8, relief: F32 | None, told: Mapping[str, Any]) -> None:
         """Send RGBA layers (N, h, w, 4) of `kind` `solved` or `flat` and, if known, relief (h, w) as 16-bit floats."""
         data = await asyncio.to_thread(lambda: layers.tobytes() + (b"" if relief is None else half_floats(relief)))
-        message = {"layers": kind, "solved_for": solved_for, "size": layers.shape[2:0:-1]}
+        message: dict[str, Any] = {"layers": kind, "size": layers.shape[2:0:-1]}
+        message |= {name: told.get(name) for name in ("solved_for", "state_version")}
         await self._say(message if relief is None else message | {"relief": relief.shape[::-1]})
         await self._socket.send_bytes(data)
 
@@ -110,7 +115,7 @@ class _Page:
         data = await asyncio.to_thread(packed)
         height, width = views.wanted[0].shape[:2]
         size = [moment.layers.shape[2], moment.layers.shape[1]]
-        message = {"layers": "solved", "solved_for": solved_for, "size": size}
+        message = {"layers": "solved", "solved_for": solved_for, "state_version": moment.state_version, "size": size}
         await self._say(message | {"target": [width, height], "frame": moment.account.frame})
         await self._socket.send_bytes(data)
 
@@ -133,6 +138,9 @@ class _Page:
                 self.news.set()
             if message.get("drawn"):
                 self._under_way = False
+                self.news.set()
+            if message.get("heard"):
+                self._unheard = False
                 self.news.set()
             if "eyes" in message and (head := self._link.head_of(me)) is not None:
                 with contextlib.suppress(ValueError, TypeError):

@@ -29,12 +29,18 @@ from tests.waiting import eventually
 
 SMALL = '[stack]\nwidth_px = 320\nheight_px = 180\n[model]\nname = "fast"\nbackend = "cpu"\n'
 TRIED = (
-    "the token is not in the address", "the pointer moved the head", "status has the eyes there to 1 mm",
+    "no token: none", "no token: another", "the token is not in the address", "the pointer moved the head",
+    "status has the eyes there to 1 mm",
     "another solution", "and the page shows it", "the picture is one", "figures are told", "light has a figure",
     "a moved head has no old figure", "and then its own", "the status and the page agree",
+    "a figure's age ticks on the page", "a head that moves has no figure, whatever the server says",
+    "a lost connection is tried again", "and has ended after some seconds", "and is there again",
+    "imperfect panels have no figure of their own", "and are ideal again",
+    "eyes apart by -3 mm", "eyes apart by 0 mm", "eyes apart by 500 mm", "eyes apart by  mm",
     "a near head aside sees no sliver", "both eyes are described", "what was asked for is shown", "for this head",
     "another head has another target", "and the newest again", "the solver is held", "an old status does not undo it",
-    "while alignment goes on", "eyes lost: flat", "and back", "a scene that is not there", "another scene",
+    "while alignment goes on", "eyes lost: flat", "and back", "a scene that is not there",
+    "a scene that is loading has no figure", "another scene", "and then a picture",
     "a new scene has no old figure", "the target is the new scene's", "another page looks on", "and takes over",
     "nobody: held, then flat", "back: tracking", "a gap out of range is refused", "it restarts, and the page says so",
     "while the rest of the page stays", "another gap", "its camera is the sensor", "and the pointer again",
@@ -86,6 +92,7 @@ class Client:
         self.relief: np.ndarray | None = None  # of the newest solution
         self.refresh: dict[str, Any] = {}
         self.stack: dict[str, Any] = {}
+        self.hears = True  # it says that it has received each refresh
 
     def __enter__(self) -> Client:
         self.socket = self._connection.__enter__()
@@ -94,8 +101,8 @@ class Client:
     def __exit__(self, *error: Any) -> None:
         self._connection.__exit__(*error)
 
-    def look(self) -> None:
-        message = json.loads(self.socket.recv(30))
+    def look(self, within_s: float = 30.0) -> None:
+        message = json.loads(self.socket.recv(within_s))
         if "layers" in message:
             kind, (width, height), received = message["layers"], message["size"], self.socket.recv(30)
             size = 4 * len(self.stack["x_m"]) * width * height
@@ -107,7 +114,10 @@ class Client:
                 assert "relief" not in message and not relief
             self.socket.send(json.dumps({"drawn": True}))
         self.stack = message.get("stack", self.stack)
-        self.refresh = message.get("refresh", self.refresh)
+        if "refresh" in message:
+            self.refresh = message["refresh"]
+            if self.hears:
+                self.say(heard=True)
 
     def until(self, holds: Any) -> bool:
         def looked() -> bool:
@@ -145,6 +155,21 @@ def test_eyes_go_in_and_layers_come_out_solved_for_them(url: str) -> None:
         client.say(eyes=None, page_ms=2.0)
         assert client.until(lambda c: c.refresh["state"] == "holding")
         assert client.until(lambda c: c.refresh["state"] == "flat" and c.refresh["flatness"] == 1.0)
+
+
+def test_a_slow_page_gets_the_present_not_the_past(url: str) -> None:
+    with Client(url) as client:
+        client.say(eyes=[[0.6, -0.03, 0.0], [0.6, 0.03, 0.0]], page_ms=1.0)
+        assert client.until(lambda c: c.refresh)
+        client.hears, frames = False, set()
+        with pytest.raises(TimeoutError):
+            while True:
+                client.look(2.0)
+                frames.add(client.refresh["frame"])
+        assert len(frames) <= 2
+        client.say(heard=True)
+        assert client.until(lambda c: c.refresh["frame"] not in frames)
+        assert client.refresh["frame"] > max(frames, default=0) + 20
 
 
 @pytest.mark.parametrize(

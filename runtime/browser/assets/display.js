@@ -483,7 +483,7 @@ export class Display {
   // gain: 0 draws the picture, 1 draws the target, and larger values draw the difference from the target, multiplied by
   // `gain`.
   see({ eye, nominal = eye, picture, part, quick = null, rays = 0, pupil_mm = 0, focus_m = centre(this.stack), side = 0, gain = 0, stride = [1, 1], room = [0.07, 0.08, 0.1] }) {
-    if (this.isBuilt) rays = Math.max(rays, BUILT_RAYS);
+    if (this.isBuilt) rays = Math.max(rays, rays && pupil_mm && this.software ? BUILT_RAYS / 2 : BUILT_RAYS);
     const g = this.g, { stack } = this, places = quick ? this.#use("quick", "solved") : this.#use(rays ? "grid" : "boxes", "shown");
     g.viewport(...part);
     const columns = [], apart = [];

@@ -39,7 +39,7 @@ const PAGE = `
 <div class="switches"><label><input type="checkbox" data-key="aligned" checked> outer panels follow the head</label>
 <label><input type="checkbox" data-key="pupil"> pupils 4 mm wide</label>
 <label class="slider"><span>focus, mm in front of the centre panel</span><input type="range" data-focus min="-150" max="150" step="5" value="0"><output>0</output></label><button type="button" class="quiet">Reset head</button></div>
-<details class="built"><summary>As built</summary><p class="how">What imperfect panels would show. See phasestack tolerance for what each costs.</p></details>
+<details class="built"><summary>As built</summary><p class="how">What imperfect panels would show. <code>phasestack tolerance</code> measures what each costs.</p><button type="button" class="quiet">Make the panels ideal</button></details>
 <p class="head" role="status"></p><p class="light"></p><div class="point"></div>
 <div class="views"><figure><svg data-axis="1" viewBox="0 0 320 170" role="img" aria-label="Eyes and panels from above"></svg><figcaption>from above</figcaption></figure>
 <figure><svg data-axis="2" viewBox="0 0 320 170" role="img" aria-label="Eyes and panels from the side"></svg><figcaption>from the side</figcaption></figure></div>
@@ -67,6 +67,7 @@ export class Look {
     this.live = false; // true if the daemon measures the light, and calls `tell`
     this.onhead = () => {}; // called after the head has moved
     this.onframe = () => {}; // called after a picture has been drawn
+    this.onchange = () => {}; // called when the picture must be drawn again
     this.onmode = () => {}; // called when a mode is chosen, with true if it needs target pictures
     this.$("h1").textContent = title;
     this.$(".stage").style.setProperty("--aspect", this.stack.width_m / this.stack.height_m);
@@ -122,7 +123,8 @@ export class Look {
     this.moving = performance.now();
     this.fresh = true;
     if (this.isMeasured && !this.live) this.$(".light").textContent = this.display.targets[0] ? "…" : "";
-    this.isMeasured = false;
+    [this.isMeasured, this.isReported] = [false, false];
+    this.onchange();
     this.next ??= requestAnimationFrame((now) => this.#frame(now));
   }
 
@@ -149,8 +151,8 @@ export class Look {
       this.strip = undefined;
       this.#paint(width, height, this.rays);
       this.onframe();
+      if (!this.isReported && (resting || now - this.reported_ms > REPORT_MS)) this.#report(aligned.limited), (this.reported_ms = now);
       if (!resting) {
-        if (now - this.reported_ms > REPORT_MS) this.#report(aligned.limited), (this.reported_ms = now);
         this.before = now;
         this.next = requestAnimationFrame((then) => this.#frame(then));
         return;
@@ -160,6 +162,7 @@ export class Look {
       if (turning) this.turn = setTimeout(again, WIGGLE_MS - (performance.now() % WIGGLE_MS) + 1);
       return;
     }
+    if (!this.isReported) this.#report(aligned.limited);
     const g = this.display.g, rows = Math.ceil(height / STRIPS);
     if (resized) this.#paint(width, height, 1);
     this.strip ??= 0;
@@ -197,8 +200,8 @@ export class Look {
 
   #paint(width, height, rays) {
     const { display, mode } = this, g = display.g, pupil_mm = this.pupil ? 4 : 0, focus_m = this.#focus_m;
-    const wide = width >= height, checks = mode === "target" || mode === "difference", two = checks || mode === "parallel" || mode === "crossed";
-    const across = two && (checks ? this.#fitsSideBySide(width, height) : wide) ? 2 : 1, down = two && across === 1 ? 2 : 1, w = Math.floor(width / across), h = Math.floor(height / down);
+    const checks = mode === "target" || mode === "difference", two = checks || mode === "parallel" || mode === "crossed";
+    const across = two && (!checks || this.#fitsSideBySide(width, height)) ? 2 : 1, down = two && across === 1 ? 2 : 1, w = Math.floor(width / across), h = Math.floor(height / down);
     this.$(".over").replaceChildren();
     g.clearColor(0.07, 0.08, 0.1, 1);
     const sides = two ? (mode === "crossed" ? [1, 0] : [0, 1]) : [mode === "right" || (mode === "wiggle" && Math.floor(performance.now() / WIGGLE_MS) % 2) ? 1 : 0];
@@ -313,16 +316,17 @@ export class Look {
   }
 
   #report(limited) {
+    this.isReported = true;
     const { eyes_m: solved } = this.scene, eyes = this.eyes;
     for (const svg of this.$(".views").querySelectorAll("svg"))
       drawPlan(svg, { stack: this.stack, eyes: [...eyes, ...this.others], solved, axis: Number(svg.dataset.axis), far_m: 0.7, sigma_m: this.sigma_m ?? 0 });
     if (this.mode !== "apart") this.$(".point").replaceChildren();
     const [x, y, z] = solved ? middle(eyes).map((v, k) => v - middle(solved)[k]) : [0, 0, 0];
     const parts = [[y, "to the right", "to the left"], [z, "up", "down"], [x, "farther", "nearer"]].filter(([v]) => mm(v));
-    const where = parts.length ? `The head is ${parts.map(([v, one, other]) => `${mm(v)} mm ${v > 0 ? one : other}`).join(", ")} from where the layers were solved for` : "The head is where the layers were solved for";
+    const where = !solved ? "" : parts.length ? `The head is ${parts.map(([v, one, other]) => `${mm(v)} mm ${v > 0 ? one : other}`).join(", ")} from where the layers were solved for` : "The head is where the layers were solved for";
     if (this.state) return void (this.$(".head").textContent = this.state);
     const limit = limited ? `; the outer panels follow only part of the way because the head is ${limited}` : "";
-    this.$(".head").textContent = `${where}${limit}.`;
+    this.$(".head").textContent = where && `${where}${limit}.`;
   }
 
   // Measure the PSNR of the light at both eyes on sampled pixels, and show it. The target pictures are treated as if
@@ -349,12 +353,13 @@ export class Look {
     this.tell(-10 * Math.log10(Math.max(error / counted - (scene.target_error ?? 0), 1e-9)));
   }
 
-  // Show the PSNR of the light at both eyes, followed by `note`.
+  // Show the PSNR of the light at both eyes, followed by `note`, or `note` alone. A live page's figure is the daemon's.
   tell(light_db, note = "") {
-    this.light_db = light_db;
-    const words = this.display.isBuilt ? "" : this.light_db > 33 ? "hard to distinguish from the target" : this.light_db > 27 ? "a good picture with faint traces of the other layers" :
-      this.light_db > 21 ? "obvious ghosts and coloured edges" : "the layers fall apart";
-    this.$(".light").textContent = `Light at both eyes: ${this.light_db.toFixed(1)} dB against the target${words && ` (${words})`}${note}.`;
+    const another = this.display.isBuilt || (this.live && !this.aligned);
+    const words = another ? (this.live ? "for ideal panels that follow the head" : "") : light_db > 33 ? "hard to distinguish from the target" :
+      light_db > 27 ? "a good picture with faint traces of the other layers" : light_db > 21 ? "obvious ghosts and coloured edges" : "the layers fall apart";
+    const text = light_db === null ? note : `Light at both eyes: ${light_db.toFixed(1)} dB against the target${words && ` (${words})`}${note}.`, box = this.$(".light");
+    if (box.textContent !== text) box.textContent = text;
   }
 
   #modes() {
@@ -425,17 +430,26 @@ export class Look {
         this.draw();
       });
     this.$(".switches button").addEventListener("click", () => this.moveTo([0, 0, 0]));
-    this.$(".built").append(...BUILT.map(([key, name, max, step, factor]) => {
+    this.$(".built button").addEventListener("click", () => this.build({}));
+    this.$(".built button").before(...BUILT.map(([key, name, max, step, factor]) => {
       const label = node("label", name), input = Object.assign(node("input"), { type: "range", min: 0, max, step, value: 0 }), output = node("output", "0");
       input.dataset.key = key;
-      input.addEventListener("input", () => {
-        output.textContent = input.value;
-        this.display.built = { ...this.display.built, [key]: input.value * factor };
-        this.draw();
-      });
+      input.addEventListener("input", () => this.build({ ...this.display.built, [key]: input.value * factor }));
       label.append(input, output);
       return label;
     }));
+  }
+
+  // Look at panels "as built". A point pupil would see the black lines as coarse hatching.
+  build(built) {
+    this.display.built = { ...IDEAL, ...built };
+    for (const [key, , , , factor] of BUILT) {
+      const input = this.$(`.built [data-key=${key}]`);
+      input.value = this.display.built[key] / factor;
+      input.nextElementSibling.textContent = input.value;
+    }
+    if (this.display.built.lines) this.$("[data-key=pupil]").checked = this.pupil = true;
+    this.draw();
   }
 
   #nearer(metres) {
@@ -459,15 +473,7 @@ export class Look {
         this.$("[data-key=aligned]").checked = this.aligned = Boolean(on);
         this.draw();
       },
-      build: (built) => {
-        this.display.built = { ...IDEAL, ...built };
-        for (const [key, , , , factor] of BUILT) {
-          const input = this.$(`.built [data-key=${key}]`);
-          input.value = this.display.built[key] / factor;
-          input.nextElementSibling.textContent = input.value;
-        }
-        this.draw();
-      },
+      build: (built) => this.build(built),
       focus: (mm) => this.focus(mm),
       picture: (eye, width, height, pupil_mm = 0) => {
         this.display.show(this.#draws());

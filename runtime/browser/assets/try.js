@@ -3,10 +3,12 @@ import { Look } from "/look.js";
 import { Choice, MORE, effortInWords, modelsOf, scenesOf } from "/choice.js";
 import { ask, token } from "/session.js";
 
-const MEASURING = "Measuring the current picture …";
 // AGAIN_MS: how often a resting head's position is sent again.
 // KEPT: number of latencies used for statistics.
-const AGAIN_MS = 500, STATUS_MS = 500, RETRY_MS = 1000, KEPT = 600;
+// ENDED_MS: for how long the server must be unreachable until the page reports that it has ended.
+// MOVED_M: how far the eyes may be from those that a figure was measured for, the same as in runtime.frame.sampling.
+const AGAIN_MS = 500, STATUS_MS = 500, RETRY_MS = 1000, ENDED_MS = 5000, MOVED_M = 0.002, KEPT = 600;
+const NO_ANSWER = "No answer from phasestack try. Trying again …";
 // PLACES_M: where each head starts.
 const PLACES_M = [[0.6, 0, 0], [0.6, 0.28, 0]];
 // A quick head's peak acceleration, the duration of its shortest movement, and the time between samples.
@@ -40,8 +42,9 @@ let me = null, people = [], solved = [], seenBy = null, heads = {};
 let checks = false, camera = null, lookedAt = null;
 // wishes: number of commands in progress. answered_ms: when the last command ended.
 // measured: number of the measured refresh whose target pictures are loaded.
-// used: numbers in use, by field name. restarting: why the daemon restarts, and whether it has begun to.
-let choices = {}, used = {}, restarting = null;
+// used: numbers in use, by field name. changing: the change whose first picture has not been drawn, or null. loaded: the
+// state that the drawn layers were solved in. trouble: why there is no connection. unreachable_ms: since when.
+let choices = {}, used = {}, changing = null, loaded = null, trouble = "", unreachable_ms = null;
 let layersSeen = { solved: false, flat: false }, first = null, wishes = 0, answered_ms = 0, measured = null;
 const latencies = [], drawn = [];
 const main = document.querySelector("main");
@@ -104,36 +107,70 @@ function see() {
 const form = (name) => main.querySelector(`[name=${name}]`);
 const told = (text) => (main.querySelector(".told").textContent = text);
 
-// Send a number if it is within the field's range. If not, report the range and show the number in use.
+// Use a number if it is within the field's range. If not, report the range and show the number in use.
 function set(field) {
-  const { name, min, max, parentElement: { textContent: label } } = field;
-  if (field.checkValidity()) {
-    if (name === "gap_mm" && Number(field.value) !== used.gap_mm) restarts(`Restarting with a gap of ${field.value} mm …`);
-    used[name] = Number(field.value);
-    told("");
-    return say({ [name]: used[name] });
+  const { name, min, max, parentElement: { textContent: label } } = field, value = Number(field.value);
+  if (!field.value || !field.checkValidity()) {
+    told(`${label.split(",")[0].trim()}: must be a number from ${min} to ${max}`);
+    return void (field.value = used[name]);
   }
-  told(`${label.split(",")[0].trim()}: must be a number from ${min} to ${max}`);
-  field.value = used[name];
+  if (name === "gap_mm" && value !== used.gap_mm) changes({ text: `Restarting with a gap of ${value} mm …`, restarts: true });
+  used[name] = value;
+  told("");
+  if (name === "turntable") wish("place", { turntable_per_min: value });
+  else if (name !== "ipd_mm") say({ [name]: value });
+  else {
+    ipd_m = value / 1000;
+    look.moveTo(look.head);
+  }
 }
 
-// The panels show the last picture until the daemon has restarted.
-function restarts(text) {
-  restarting = { text, begun: false };
-  look.notice(text);
+// The panels show the last picture until the change has been made, and then until its first picture has been solved.
+function changes(change) {
+  changing = change && { ...change, from: loaded };
+  refreshed();
 }
 
-async function wish(command, value = null) {
+// Send a command to the daemon. change: what it changes in the picture (`changes`), or undefined.
+async function wish(command, value = null, change = undefined) {
   told(`${command} …`);
   wishes += 1;
   try {
-    const answer = await (await ask("/do", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ command, value }) })).json();
+    const answer = await (await reach("/do", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ command, value }) })).json();
     told(answer.ok ? "" : answer.error);
+    if (!answer.ok && change === changing) changes(null);
   } catch {
-    told("phasestack try has ended. Start it again and open the address it prints.");
+    told(`No answer to: ${command}. Try again.`);
+    if (change === changing) changes(null);
   }
   wishes -= 1;
   answered_ms = performance.now();
+}
+
+// Like `ask`, and keep since when the server has been unreachable.
+async function reach(...request) {
+  try {
+    const answer = await ask(...request);
+    unreachable_ms = null;
+    trouble = answer.status === 401 ? "The token in this page's address is missing or wrong. Open the address that phasestack try printed." :
+      trouble && !socket.isHeard ? NO_ANSWER : "";
+    return answer;
+  } catch (error) {
+    unreachable_ms ??= performance.now();
+    if (trouble && performance.now() - unreachable_ms > ENDED_MS) trouble = "phasestack try has ended. Start it again and open the address it prints.";
+    throw error;
+  } finally {
+    refreshed();
+  }
+}
+
+// Show why there is no picture, or why it is not of what was chosen.
+function refreshed() {
+  const starting = main.querySelector(".starting"), nobody = newest?.state && !newest.people.length;
+  if (starting && trouble) starting.textContent = trouble;
+  look?.notice(trouble || changing?.text.concat(changing.reason ?? "") || (!layersSeen.solved && !nobody ? "Solving the first picture …" : !checks ? "" :
+    measured === null ? "Measuring the current picture …" : newest && newest.measured_frame !== measured ? "This was measured before the last change. Measuring again …" : ""));
+  light();
 }
 
 function build({ stack, fov_deg }) {
@@ -144,6 +181,7 @@ function build({ stack, fov_deg }) {
   look.live = true;
   look.onhead = follow;
   look.onmode = check;
+  look.onchange = light;
   main.querySelector(".first").innerHTML = FIRST;
   main.querySelector(".more").innerHTML = CONTROLS;
   choices = {
@@ -151,16 +189,14 @@ function build({ stack, fov_deg }) {
     model: new Choice(form("model"), form("model_file"), { text: "an ONNX file …" }),
   };
   for (const [name, value] of [["noise_mm", 0.2], ["latency_ms", 0], ["ipd_mm", ipd_m * 1000]]) form(name).value = used[name] = value;
-  used.camera_fov_deg = 65;
-  for (const name of ["noise_mm", "latency_ms", "gap_mm", "camera_fov_deg"]) form(name).addEventListener("change", (event) => set(event.target));
-  look.notice("Solving the first picture …");
-  form("ipd_mm").addEventListener("change", (event) => {
-    ipd_m = Math.max(45, Math.min(80, Number(event.target.value))) / 1000;
-    look.moveTo(look.head);
-  });
+  Object.assign(used, { camera_fov_deg: 65, turntable: 0 });
+  for (const name of ["noise_mm", "latency_ms", "ipd_mm", "gap_mm", "turntable", "camera_fov_deg"]) form(name).addEventListener("change", (event) => set(event.target));
   for (const [name, choice] of Object.entries(choices))
-    for (const field of [choice.select, choice.other]) field.addEventListener("change", () => choice.value && wish(name, choice.value));
-  form("turntable").addEventListener("change", (event) => wish("place", { turntable_per_min: Number(event.target.value) }));
+    for (const field of [choice.select, choice.other]) field.addEventListener("change", () => {
+      if (!choice.value) return;
+      changes({ text: `Loading the ${name} ${choice.value} …` });
+      wish(name, choice.value, changing);
+    });
   form("held").addEventListener("change", (event) => wish(event.target.checked ? "pause" : "resume"));
   form("lost").addEventListener("change", see);
   form("seen_by").addEventListener("change", (event) => {
@@ -183,7 +219,7 @@ function check(on) {
   checks = on;
   measured = null;
   for (const side of [0, 1]) look.display.target(side, null);
-  look.notice(on ? MEASURING : "");
+  refreshed();
   say({ checks });
 }
 
@@ -270,7 +306,7 @@ function introduce() {
 
 function take({ refresh, head, page_ms }) {
   const before = newest, moved = me !== head;
-  [newest, me] = [{ ...refresh, page_ms }, head];
+  [newest, me] = [{ ...refresh, page_ms, measured_ms: performance.now() - 1000 * refresh.light_age_s }, head];
   if (!look || !refresh.state) return;
   if (refresh.people.length) people = refresh.people;
   for (const one of people) if (one.head !== null) heads[one.number] = one.head;
@@ -283,24 +319,28 @@ function take({ refresh, head, page_ms }) {
   look.flatness = flatness;
   const state = refresh.state === "tracking" ? (checks ? age(refresh) : "") : explained(refresh), told = state === look.state;
   look.state = state;
-  light(refresh);
+  const { state_version, is_current } = refresh, since_s = (performance.now() - answered_ms) / 1000;
+  const made = refresh.people.length ? is_current && state_version === loaded : since_s > 2;
+  if (changing && !changing.restarts && !wishes && made && (loaded !== changing.from || since_s > 2)) changing = null;
+  refreshed();
   if (!same || !told) look.draw();
   if (layersSeen.solved && flatness < 1) first?.();
 }
 
-// Show the light that the daemon has measured for these eyes, this content and this model. Until it has, show no figure.
-function light({ state, light_db, light_age_s }) {
-  const known = typeof light_db === "number", old = light_age_s >= 2 ? `, measured ${light_age_s.toFixed(0)} s ago` : "";
-  if (known) look.tell(light_db, old);
-  else main.querySelector(".light").textContent = state === "tracking" && layersSeen.solved ? "Light at both eyes: not measured yet for this picture." : "";
+// Show the light that the daemon has measured, if it belongs to the picture drawn now: to its content, model and eyes.
+function light() {
+  if (!look) return;
+  const { state, light_db, measured_ms, measured_frame, state_version } = newest ?? {}, eyes_m = seen()?.eyes_m, s = (performance.now() - measured_ms) / 1000;
+  const tracked = state === "tracking" && layersSeen.solved && !changing && !trouble;
+  const here = checks ? measured_frame === measured : state_version === loaded && eyes_m?.flat().every((v, k) => Math.abs(v - look.eyes.flat()[k]) <= MOVED_M);
+  if (tracked && here && typeof light_db === "number") look.tell(light_db, s >= 2 ? `, measured ${s.toFixed(0)} s ago` : "");
+  else look.tell(null, tracked ? "Light at both eyes: not measured yet for this picture." : "");
 }
 
 // What the target pictures belong to. Older ones stay until the current refresh has been measured.
 function age({ measured_frame }) {
   if (measured === null) return "";
-  const current = measured_frame === measured;
-  look.notice(current ? "" : "This was measured before the last change. Measuring again …");
-  return current ? "Measured for this position of the head." : "Measured before the head, the scene or the model changed.";
+  return measured_frame === measured ? "Measured for this position of the head." : "Measured before the head, the scene or the model changed.";
 }
 
 // A message that explains why the picture differs from what the two eyes should see.
@@ -313,7 +353,7 @@ function explained({ state, reason }) {
 }
 
 function load(bytes) {
-  const { layers: kind, solved_for, target, relief, frame, size: [w, h] } = pending, size = 4 * w * h * look.stack.x_m.length;
+  const { layers: kind, solved_for, state_version, target, relief, frame, size: [w, h] } = pending, size = 4 * w * h * look.stack.x_m.length;
   if (kind === "solved") solved = solved_for, settle();
   look.display.load(kind, new Uint8Array(bytes, 0, size), [w, h]);
   if (kind === "solved") look.display.unfold(relief ? new Uint16Array(bytes, size, relief[0] * relief[1]) : null, relief);
@@ -325,49 +365,56 @@ function load(bytes) {
     measured = person < 0 ? null : frame;
   }
   layersSeen[kind] = true;
-  if (kind === "solved" && restarting?.begun) restarting = null;
-  if (kind === "solved" && !restarting) look.notice(checks && measured === null ? MEASURING : "");
+  if (kind === "solved") [loaded, changing] = [state_version, changing?.begun ? null : changing];
+  refreshed();
   look.draw();
   say({ drawn: true });
 }
 
 function connect() {
-  socket = new WebSocket(`ws://${location.host}/live`, ["phasestack", token()]);
+  socket = new WebSocket(`ws://${location.host}/live`, ["phasestack", token() || "none"]); // an empty one would be an error
   socket.binaryType = "arraybuffer";
   socket.onmessage = ({ data }) => {
     if (typeof data !== "string") return load(data);
     const message = JSON.parse(data);
+    [socket.isHeard, trouble] = [true, ""];
     if (message.layers) pending = message;
     else if (message.stack) {
       layersSeen = { solved: false, flat: false };
-      if (restarting) restarting.begun = true;
-      measured = null;
+      if (changing?.restarts) changing.begun = true;
+      [measured, newest, loaded] = [null, null, null];
       [mode, people, solved, seenBy, heads] = [message, [], [], null, {}];
       const same = look && ["width_px", "height_px"].every((k) => look.stack[k] === message.stack[k]) && look.stack.x_m.length === message.stack.x_m.length;
-      if (same) look.turnTo(message.stack), look.notice(restarting?.text ?? "Solving the first picture …");
+      if (same) look.turnTo(message.stack);
       else build(message);
+      refreshed();
       form("camera").checked = message.is_camera;
       form("camera_fov_deg").parentElement.hidden = mode.is_sensor;
       if (mode.is_sensor) main.querySelector(".found").hidden = true;
       form("gap_mm").value = used.gap_mm = Math.round(1e5 * (message.stack.x_m[1] - message.stack.x_m[0])) / 100;
       if (checks) say({ checks });
     } else if (message.found) found(message.found);
-    else if (message.refresh) take(message);
+    else if (message.refresh) {
+      say({ heard: true });
+      take(message);
+    }
   };
   socket.onclose = () => {
     [newest, drawn.length, latencies.length] = [null, 0, 0];
     for (const kind of [".figures", ".head"]) main.querySelector(kind)?.replaceChildren();
-    look?.notice("phasestack try has ended. Start it again and open the address it prints.");
+    socket.isHeard = false;
+    trouble ||= NO_ANSWER;
+    refreshed();
     setTimeout(connect, RETRY_MS);
   };
 }
 
-const status = async () => (await ask("/now/status")).json();
+const status = async () => (await reach("/now/status")).json();
 const number = (value, digits = 1) => (value ?? 0).toFixed(digits);
 
 async function about() {
   try {
-    const answer = await (await ask("/now/about")).json();
+    const answer = await (await reach("/now/about")).json();
     if (!answer.ok) throw new Error(answer.error);
     choices.scene.offer(scenesOf(answer));
     choices.model.offer(modelsOf(answer));
@@ -397,6 +444,7 @@ function figures(now, asked_ms) {
   main.querySelector(".figures")?.replaceChildren(...Object.entries(rows).filter(([, text]) => text).flatMap(([name, text]) =>
     [["dt", name], ["dd", text]].map(([kind, textContent]) => Object.assign(document.createElement(kind), { textContent }))));
   if (wishes || asked_ms < answered_ms) return;
+  if (changing) changing.reason = now.paused ? " (the solver is paused)" : "";
   for (const [name, value] of [["scene", now.scene], ["model", now.model_asked]]) {
     const { select, other, isOther } = choices[name];
     if (![select, other].includes(document.activeElement) && !(isOther && !other.value)) choices[name].value = value;
@@ -408,9 +456,9 @@ async function report() {
   try {
     const asked_ms = performance.now(), now = await status();
     const starting = main.querySelector(".starting");
-    if (starting && now.reason) starting.textContent = `Starting: ${now.reason}. The first start on a machine takes about ten seconds longer.`;
+    if (starting && now.reason && !trouble) starting.textContent = `Starting: ${now.reason}. The first start on a machine takes about ten seconds longer.`;
     if (look && now.ok && now.scene !== undefined) figures(now, asked_ms); // before the first refresh, keep the old figures
-    else if (look && restarting && now.reason) look.notice(`${restarting.text} (${now.reason})`);
+    else if (changing?.restarts && now.reason) changing.reason = ` (${now.reason})`;
   } catch {
     // The failure is reported by the handler for closed connections.
   }
@@ -423,7 +471,10 @@ window.phasestack = {
   eyes: () => look.eyes,
   latencies: () => [...latencies],
 };
-setInterval(() => { if (performance.now() - lastSent >= AGAIN_MS) see(); }, AGAIN_MS);
+setInterval(() => {
+  if (performance.now() - lastSent >= AGAIN_MS) see();
+  light(); // its age
+}, AGAIN_MS);
 document.addEventListener("visibilitychange", see);
 connect();
 report();
