@@ -33,6 +33,7 @@ WITH_ALPHA = {"vp8": "libvpx", "vp9": "libvpx-vp9"}  # decoders of the transpare
 STEREO = {1: "side-by-side", 2: "top-bottom"}  # FFmpeg's AVStereo3DType
 # FFmpeg's AVStereo3DType from 3 to 8
 UNSEEN = "alternating frames", "checkerboard", "quincunx", "alternating rows", "alternating columns", "MV-HEVC"
+BT709, UNSPECIFIED = 1, 2  # AVColorSpace
 HALF_EQUIRECTANGULAR = 3  # AVSphericalProjection
 
 # The camera may answer with a playlist (HLS), but not make FFmpeg open local files.
@@ -294,6 +295,8 @@ def _progressive(frame: av.VideoFrame) -> Any:
 
 
 def _rgb(frame: av.VideoFrame, background: Colour) -> U8:
+    if frame.colorspace == UNSPECIFIED and (frame.width >= 1280 or frame.height > 576):  # as players do
+        frame.colorspace = BT709
     if any(component.is_alpha for component in frame.format.components):
         rgba = np.asarray(frame.to_ndarray(format="rgba"), np.uint8)
         picture = composed(rgba[..., :3], rgba[..., 3:], background)

@@ -10,6 +10,7 @@ from typing import Any
 import av
 import numpy as np
 import pytest
+from av.video.reformatter import Colorspace
 
 from runtime.config import ContentSettings
 from runtime.content.frames import Video
@@ -36,8 +37,9 @@ def write(
     """A film of streams of pictures with their times in ms.
 
     options: `form`, FFmpeg's name of the container; `aspect`, the pixels' width over height; `base` of the times in s,
-    else ms; others are the encoder's.
+    else ms; `matrix`, the colours' matrix, not declared; others are the encoder's.
     """
+    matrix = options.pop("matrix", None)
     form, aspect, base = options.pop("form", None), options.pop("aspect", None), options.pop("base", Fraction(1, 1000))
     with av.open(str(path), "w", format=form) as out:
         made = []
@@ -53,7 +55,7 @@ def write(
         for stream, pictures in zip(made, streams, strict=True):
             for at_ms, picture in pictures:
                 kind = "rgba" if picture.shape[2] == 4 else "rgb24"
-                frame = av.VideoFrame.from_ndarray(picture, format=kind).reformat(format=pix_fmt)
+                frame = av.VideoFrame.from_ndarray(picture, format=kind).reformat(format=pix_fmt, dst_colorspace=matrix)
                 frame.pts, frame.time_base = at_ms, base
                 out.mux(stream.encode(frame))
             out.mux(stream.encode(None))
@@ -236,6 +238,13 @@ def test_paper_white_of_a_pq_film_is_white(tmp_path: Path) -> None:
             pictures = [(0, grey(code))]
             path = write(tmp_path / "a.mp4", pictures, codec="libx264", pix_fmt="yuv420p10le", **colours)
             assert played(path, [0])[0] == pytest.approx(wanted, abs=10), (transfer, code)
+
+
+@pytest.mark.parametrize(("height", "matrix"), [(576, Colorspace.ITU601), (720, Colorspace.ITU709)])
+def test_colours_without_a_matrix_have_that_of_their_size(tmp_path: Path, height: int, matrix: Colorspace) -> None:
+    picture = np.full((height, 720, 3), (200, 40, 40), np.uint8)
+    shown = open_frames(write(tmp_path / "a.mp4", [(0, picture)], matrix=matrix), AUTO).frame(0)
+    assert np.abs(shown[300, 300].astype(int) - (200, 40, 40)).max() < 8
 
 
 def test_a_film_that_is_cut_off_repeats_what_is_there(tmp_path: Path) -> None:
