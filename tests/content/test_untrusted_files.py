@@ -20,7 +20,7 @@ import pytest
 from PIL import EpsImagePlugin, Image
 
 from runtime.clock import MonotonicClock
-from runtime.commands.eyes_looking import _filmed
+from runtime.commands.eyes_looking import _frames
 from runtime.config import ContentSettings, SensorSettings
 from runtime.content.frames import open_frames
 from runtime.content.mesh import load_mesh
@@ -132,7 +132,7 @@ def test_a_script_under_a_film_s_name_opens_no_other_file(tmp_path: Path) -> Non
     for name, text in (("a.mp4", f"ffconcat version 1.0\nfile {other}\n"), ("concat:secret.mp4", "")):
         (tmp_path / name).write_text(text)
         with pytest.raises(InputError, match="cannot be decoded as a film"):
-            list(_filmed(tmp_path / name))
+            list(_frames(tmp_path / name, 0, 30.0))
         with pytest.raises(SensorLost, match="cannot be opened"):
             UsbCameraDriver(SensorSettings(source=str(tmp_path / name), fov_deg=60.0), MonotonicClock()).open()
 
