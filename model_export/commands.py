@@ -68,10 +68,10 @@ def train(
     require("torch")
     from model_export.train import Training, run_training
     from runtime.config import validated
-    from runtime.support.artifacts import refuse_file
+    from runtime.support.artifacts import refuse_unwritable
     from runtime.support.figures import shown
 
-    refuse_file(out)
+    refuse_unwritable(out)
     settings = {
         "arch": arch,
         "options": options_of(option),

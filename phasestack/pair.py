@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from phasestack.pictures import as_array, as_codes, as_numbers, as_picture
 from phasestack.stack import checked_stack
 from runtime.errors import InputError, ModelFailure
-from runtime.evaluation.displayed import SIGMAS_MM, Picture
+from runtime.evaluation.displayed import SIGMAS_MM, Picture, on_panels_raster
 from runtime.evaluation.solved import PairQuality, SolvedPair
 from runtime.model.job import VIEWS_MOST
 from runtime.model.predictor import Predictor, load_predictor
@@ -339,10 +339,11 @@ def _on_real_panels(pair: _Pair, layers: U8, panels: RealPanels, how: Measuring)
     """Measure the light of layers on real panels. Raises as `_options` does, and if the panels do not fit the stack."""
     if not isinstance(panels, RealPanels):
         raise ValueError(f"panels: must be phasestack.RealPanels, not {type(panels).__name__}")
-    height, width = pair.pictures[0].shape[:2]
+    targets = tuple(on_panels_raster(picture, pair.stack) for picture in pair.pictures)
+    height, width = targets[0].shape[:2]
     usual: Measuring = {"sigmas_mm": (1.0,), "every": max(1, round(math.sqrt(height * width / REAL_PIXELS)))}
-    sigmas, every = _options(pair.pictures, usual | how)
-    sight = Sight(pair.eyes_m, pair.pictures, pair.fov_deg)
+    sigmas, every = _options(targets, usual | how)
+    sight = Sight(pair.eyes_m, targets, pair.fov_deg)
     light = {
         f"{sigma:g}": real_light(
             layers, pair.stack, panels, replace(sight, sigma_mm=sigma), RealSampling(step=every)

@@ -47,10 +47,10 @@ def report(
     """
     from runtime.errors import FatalError, InputError
     from runtime.report.assemble import Own, whole_report
-    from runtime.support.artifacts import refuse_file, to_json
+    from runtime.support.artifacts import refuse_unwritable, to_json
     from runtime.support.progress import status_line
 
-    refuse_file(out)
+    refuse_unwritable(out)
     if only_pairs and pairs is None:
         raise InputError("report", "--only-pairs", "requires --pairs")
     parts = ["phasestack report", *([f"--pairs {pairs.name}"] if pairs else []), *(["--focal"] if focal else [])]

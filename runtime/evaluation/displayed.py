@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -22,6 +22,7 @@ from runtime.support.artifacts import write_png
 from runtime.support.threads import parallel_map
 
 Picture = U8 | F32  # (h, w, 3), code values or intensities in [0, 1]
+P = TypeVar("P", bound=Picture)
 SIGMAS_MM = (0.0, 1.0, 2.0)  # tracking errors: none, a good tracker's, and twice a good tracker's
 
 
@@ -105,7 +106,7 @@ def expected_quality(
     return Expected({name: psnr_db(error[0]) for name, error in named.items()}, standard_errors)
 
 
-def on_panels_raster(picture: Picture, stack: PanelStack) -> Picture:
+def on_panels_raster(picture: P, stack: PanelStack) -> P:
     """Resample a picture to the panels' resolution. A picture with a different aspect ratio keeps it, and
     is reduced if it has more pixels than a panel. Panels cannot show finer detail, and measuring it would cost time and
     memory.

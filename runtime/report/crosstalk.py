@@ -31,6 +31,7 @@ DISPARITIES_MM = (2.0, 4.0, 8.0, 16.0, 32.0)
 WIDE_MM = 60.0  # width of the patch that has a disparity
 INNER = 0.6  # share of a region's width and height that is measured
 MOVES_MM = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
+NEAR_M = 0.02  # least distance between the viewer and the front panel
 FALL_DB = 3.0  # the picture counts as good as far as light falls by less than this
 FOV_DEG = 40.0
 Rectangle = tuple[float, float, float, float]  # left, right, bottom, top in metres on the plane x = 0
@@ -182,9 +183,13 @@ PLACES = ((0.4, 0.0), (0.6, 0.0), (0.9, 0.0), (1.2, 0.0), (0.6, 20.0), (0.6, 40.
 def freedom_with_tracking(
     stack: PanelStack, scene: str, solve: Callable[[StillPair], float]
 ) -> Iterator[dict[str, float]]:
-    """Yield `distance_m`, `angle_deg` and `light_db` of `PLACES` of the head, solved for each by `solve`."""
+    """Yield `distance_m`, `angle_deg` and `light_db` of `PLACES` of the head in front of all panels, solved for each
+    by `solve`.
+    """
     small = reduced(stack)
     with PairPainter(scene, replace(small)) as painter:
         for distance_m, angle_deg in PLACES:
-            pair = painter.pair("", eyes_at(distance_m=distance_m, angle_deg=angle_deg, height_m=0.03), off_mm=())
-            yield {"distance_m": distance_m, "angle_deg": angle_deg, "light_db": solve(pair)}
+            eyes_m = eyes_at(distance_m=distance_m, angle_deg=angle_deg, height_m=0.03)
+            if eyes_m[:, 0].min() > stack.x_m[-1] + NEAR_M:
+                light_db = solve(painter.pair("", eyes_m, off_mm=()))
+                yield {"distance_m": distance_m, "angle_deg": angle_deg, "light_db": light_db}

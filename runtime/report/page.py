@@ -17,6 +17,7 @@ from typing import Any
 from runtime.support.artifacts import OutputFolder, write_bytes, write_json, write_text
 
 STYLE = ["seaborn-v0_8-whitegrid", {"figure.dpi": 130, "axes.spines.top": False, "axes.spines.right": False}]
+FIGURE_LENGTH = 16  # characters of a number with its unit, at most
 PACKAGES = (
     "phasestack", "numpy", "scipy", "onnxruntime", "opencv-contrib-python-headless", "moderngl", "matplotlib",
 )  # fmt: skip
@@ -43,6 +44,11 @@ class Table:
     headings: Sequence[str]
     rows: Sequence[Sequence[str]]
     caption: str = ""
+
+    def is_numeric(self, column: int) -> bool:
+        """Return True if a column contains only figures."""
+        cells = [row[column] for row in self.rows]
+        return all(not cell or (cell[0] in "+-0123456789" and len(cell) <= FIGURE_LENGTH) for cell in cells)
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import BaseModel, Field
+from pydantic import Field
 
-from runtime.config import StackGeometry, read_table, validated
+from runtime.config import Section, StackGeometry, read_table, validated
 from runtime.errors import InputError
 from runtime.model.job import VIEWS_MOST
 from runtime.optics.stack import PanelStack
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 Metres = Annotated[float, Field(strict=True, ge=-EYE_MOST_M, le=EYE_MOST_M)]
 Place = tuple[Metres, Metres, Metres]  # frame `stack`
 OFF_MM = (2, 4, 6)  # eye displacements to draw targets for
+SEPARATION_MOST_M = 1.0  # largest distance between one viewer's eyes; more is a mistake
 FOV_DEG = 40.0  # the drawn pictures' horizontal field of view
 
 
@@ -51,7 +52,7 @@ class StillPair:
     off: tuple[OffView, ...] = ()  # further targets, for displaced eyes
 
 
-class OffEntry(BaseModel):
+class OffEntry(Section):
     """An entry in a case file that describes the target picture for a displaced eye."""
 
     mm: Annotated[float, Field(strict=True, ge=0, le=1000 * EYE_MOST_M)]
@@ -59,7 +60,7 @@ class OffEntry(BaseModel):
     image: str
 
 
-class CaseFile(BaseModel):
+class CaseFile(Section):
     """A case file's validated contents (docs/contracts.md)."""
 
     panels: dict[str, Any]  # fields of StackGeometry
@@ -107,6 +108,10 @@ def _case(path: Path, table: dict[str, Any]) -> StillPair:
     eyes = np.array(case.eyes)
     if not (eyes[:, 0] > max(stack.x_m)).all():
         raise InputError(path, "eyes", "must be in front of every panel")
+    for n in range(0, len(eyes) - 1, 2):
+        apart_m = float(np.linalg.norm(eyes[n + 1] - eyes[n]))
+        if apart_m > SEPARATION_MOST_M:
+            raise InputError(path, f"eyes.{n + 1}", f"is {apart_m:g} m from the other eye; positions are in metres")
     off = []
     for view in case.off:
         image = read_image(path.parent / view.image)

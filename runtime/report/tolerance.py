@@ -13,13 +13,14 @@ from typing import Any, TypeVar
 import numpy as np
 
 from runtime.config import ModelSettings
+from runtime.evaluation.displayed import on_panels_raster
 from runtime.model.predictor import load_predictor
 from runtime.model.still import solve_still
 from runtime.optics.carried import expected_errors
 from runtime.optics.light import LIGHT
 from runtime.optics.quality import psnr_db
 from runtime.optics.real.cells import Cell, Curve
-from runtime.optics.real.light import RealLight, RealSampling, Sight, real_light
+from runtime.optics.real.light import RealSampling, Sight, real_light
 from runtime.optics.real.panels import Lighting, Optics, Placement, RealPanels, Timing
 from runtime.optics.stack import PanelStack
 from runtime.records import U8
@@ -42,17 +43,20 @@ class Imperfection:
     name: str
     unit: str  # unit of `sizes`, "" for a choice
     sizes: tuple[float, ...]  # the first is that of ideal panels
-    assumed: float  # size in the build as ordered and mounted by hand
+    assumed: float  # size with ordinary monitors that are mounted by hand and not calibrated
     left: float  # size that is left after `remedy`
     remedy: str  # what reduces it from `assumed` to `left`, or empty
     make: Make  # panels with this imperfection alone
     note: str = ""
     make_left: Make | None = None  # panels after the remedy, of the size `assumed`; None: those of the size `left`
     choices: tuple[str, ...] = ()  # names of `sizes`, for a choice
+    is_avoided: bool = False  # the stack does not have it, because other panels are ordered
 
     def named(self, size: float) -> str:
         """Return a size with its unit, or the name of a choice."""
-        return self.choices[self.sizes.index(size)] if self.choices else f"{size:.3g} {self.unit}"
+        if self.choices:
+            return self.choices[self.sizes.index(size)]
+        return f"{size:.3g} {self.unit}" if size != self.sizes[0] else "none"
 
     def after(self, stack: PanelStack) -> RealPanels:
         """Return the panels after the remedy."""
@@ -85,7 +89,6 @@ class Cost:
     light_db: list[float] = field(default_factory=list)  # for each size
     assumed_db: float = math.nan  # light at the assumed size
     left_db: float = math.nan  # light at the size that is left
-    brightness: float = 1.0  # full white's luminance at the assumed size, as a share of ideal panels'
 
     def costs_1_db_at(self, ideal_db: float) -> float | None:
         """Return the size that costs 1 dB, interpolated, or None if no size does or it is a choice."""
@@ -101,7 +104,9 @@ class Cost:
 
 
 def solved(pair: StillPair, model: str = "balanced") -> Subject:
-    """Compute the layers for a pair, and their light on ideal panels."""
+    """Compute the layers for a pair, and their light on ideal panels. Light is compared with the pictures at the
+    panels' resolution, as `solve` does.
+    """
     predictor = load_predictor(model, pair.stack, ModelSettings(backend="cpu"))
     try:
         left, right = pair.images
@@ -111,6 +116,7 @@ def solved(pair: StillPair, model: str = "balanced") -> Subject:
     finally:
         predictor.close()
     codes = np.ascontiguousarray(layers[..., :3])
+    pair = replace(pair, images=tuple(on_panels_raster(picture, pair.stack) for picture in pair.images))
     return Subject(pair, codes, ideal_error(pair, codes))
 
 
@@ -133,20 +139,18 @@ class Bench:
         self.ideal_db = psnr_db(float(np.mean([subject.ideal_error for subject in subjects])))
         self._same_rays: dict[tuple[int, RealSampling], float] = {}  # error of ideal panels, by subject
 
-    def light(self, make: PanelMaker, pixels: int) -> tuple[float, float]:
-        """Return the light in dB on panels that `make` describes for a stack, and full white's brightness."""
-        errors, brightness = [], []
+    def light(self, make: PanelMaker, pixels: int) -> float:
+        """Return the light in dB on panels that `make` describes for a stack."""
+        errors = []
         for number, subject in enumerate(self.subjects):
             panels, sampling = make(subject.pair.stack), subject.sampling(pixels)
             if panels.optics.filters is not None:  # few rays pass, so trace more of them through fewer pixels
                 sampling = subject.sampling(pixels // 3)._replace(rays=16)
-            real = self._measured(subject, panels, sampling)
             key = (number, sampling)
             if key not in self._same_rays:
-                self._same_rays[key] = self._measured(subject, RealPanels(), sampling).error
-            errors.append(subject.ideal_error + real.error - self._same_rays[key])
-            brightness.append(real.brightness)
-        return psnr_db(float(np.mean(errors))), float(np.mean(brightness))
+                self._same_rays[key] = self._error(subject, RealPanels(), sampling)
+            errors.append(subject.ideal_error + self._error(subject, panels, sampling) - self._same_rays[key])
+        return psnr_db(float(np.mean(errors)))
 
     def first(self, imperfections: Sequence[Imperfection]) -> Iterator[Cost]:
         """Measure each imperfection at its assumed size and at what is left of it, with few pixels."""
@@ -156,11 +160,11 @@ class Bench:
         """Measure each imperfection at all sizes."""
         yield from self._each(imperfections, lambda one: self._cost(one, one.sizes, PIXELS))
 
-    def _measured(self, subject: Subject, panels: RealPanels, sampling: RealSampling) -> RealLight:
-        return real_light(subject.layers, subject.pair.stack, panels, subject.sight, sampling)
+    def _error(self, subject: Subject, panels: RealPanels, sampling: RealSampling) -> float:
+        return real_light(subject.layers, subject.pair.stack, panels, subject.sight, sampling).error
 
-    def lights(self, makes: Sequence[PanelMaker], pixels: int) -> Iterator[tuple[float, float]]:
-        """Yield the light and brightness of several panels, measured at the same time."""
+    def lights(self, makes: Sequence[PanelMaker], pixels: int) -> Iterator[float]:
+        """Yield the light of several panels, measured at the same time."""
         yield from self._each(makes, lambda make: self.light(make, pixels))
 
     def _each(self, items: Sequence[T], measure: Callable[[T], R]) -> Iterator[R]:
@@ -168,19 +172,23 @@ class Bench:
             yield from pool.map(measure, items)
 
     def _cost(self, one: Imperfection, sizes: Sequence[float], pixels: int) -> Cost:
-        lights: dict[float, tuple[float, float]] = {one.sizes[0]: (self.ideal_db, 1.0)}
+        lights = {one.sizes[0]: self.ideal_db}
         for size in (*sizes, one.assumed):
             if size not in lights:
                 lights[size] = self.light(partial(one.make, size), pixels)
         same = one.make_left is None and one.left in lights
-        left_db = lights[one.left][0] if same else self.light(one.after, pixels)[0]
-        return Cost(one, [lights[size][0] for size in sizes], lights[one.assumed][0], left_db, lights[one.assumed][1])
+        left_db = lights[one.left] if same else self.light(one.after, pixels)
+        return Cost(one, [lights[size] for size in sizes], lights[one.assumed], left_db)
 
 
 def together(imperfections: Sequence[Imperfection], stack: PanelStack, *, left: bool) -> RealPanels:
-    """Return panels with all imperfections at their assumed sizes, or with what remedies leave of them."""
+    """Return panels with all imperfections at their assumed sizes, or with what remedies leave of them. Those that are
+    avoided are left out.
+    """
     real = RealPanels()
     for one in imperfections:
+        if one.is_avoided:
+            continue
         real = merged(real, one.after(stack) if left else one.make(one.assumed, stack), stack.count)
     return real
 
@@ -239,23 +247,23 @@ def _contrast(percent: float) -> float:
     return 100.0 / percent if percent else math.inf
 
 
-def _filters(choice: float, stack: PanelStack) -> RealPanels:
-    if not choice:
-        return RealPanels()
-    filters = {1.0: (False,) * stack.count, 2.0: _fewer_filters(stack), 3.0: (True,) * stack.count}[float(choice)]
-    return RealPanels(optics=Optics(filters=filters, aperture=APERTURE))
+def filters_of(stack: PanelStack) -> tuple[bool, ...]:
+    """Return which panels have colour filters."""
+    return stack.colour or (True,) * stack.count
 
 
-def _fewer_filters(stack: PanelStack) -> tuple[bool, ...]:
-    """Return which panels keep their filters: those of the configuration, or the rear one alone."""
-    return stack.colour or tuple(n == 0 for n in range(stack.count))
+def monitor_share(stack: PanelStack) -> float:
+    """Return full white's luminance, as a share of what the rear monitor would show on its own."""
+    return float(APERTURE ** (stack.count - 1) * FILTERED ** sum(filters_of(stack)[1:]))
 
 
-def _brighter(lux: float, stack: PanelStack) -> RealPanels:
-    """Return panels under a room's light in front of a monitor of 300 cd/m²; a filter transmits 85% of a third."""
-    further = max(sum(_fewer_filters(stack)) - 1, 0)
-    white_cd_m2 = 300.0 * APERTURE ** (stack.count - 1) * (0.85 / 3) ** further
-    return RealPanels(lighting=Lighting(room_lux=lux, white_cd_m2=white_cd_m2))
+def _pixels(choice: float, stack: PanelStack) -> RealPanels:
+    filters = {0: None, 1: None, 2: (False,) * stack.count, 3: filters_of(stack)}[int(choice)]
+    return RealPanels(optics=Optics(filters=filters, aperture=APERTURE if choice else 1.0, diffracts=bool(choice)))
+
+
+def _room(lux: float, stack: PanelStack) -> RealPanels:
+    return RealPanels(lighting=Lighting(room_lux=lux, white_cd_m2=MONITOR_CD_M2 * monitor_share(stack)))
 
 
 def cell_choice(choice: float, count: int) -> RealPanels:
@@ -281,12 +289,13 @@ def slow_panels(ms: float, stack: PanelStack, *, allowed: bool = False, head_m_s
     return RealPanels(timing=Timing(head_m_s=head_m_s, response_ms=ms, allowed_ms=late))
 
 
-def _upside_down(share: float, stack: PanelStack) -> RealPanels:
-    return RealPanels(timing=Timing(scan=share, bottom_up=(False,) * (stack.count - 1) + (True,)))
+def _upside_down(percent: float, stack: PanelStack) -> RealPanels:
+    return RealPanels(timing=Timing(scan=percent / 100, bottom_up=(False,) * (stack.count - 1) + (True,)))
 
 
-APERTURE = 0.6
-FEWER = "colour filters on the rear panel alone, or as stack.colour"
+APERTURE = 0.6  # open share of a subpixel's area
+FILTERED = 0.85 / 3  # share of the light that a colour filter transmits
+MONITOR_CD_M2 = 300.0  # luminance of full white on the rear monitor alone
 REGISTRATION = "registration (calibrate panels)"
 # The assumed sizes describe three 27-inch monitors that are mounted by hand (docs/planning.md says where from).
 IMPERFECTIONS = (
@@ -340,20 +349,16 @@ IMPERFECTIONS = (
         lambda nm, _: _cells(retardance_nm=nm),
     ),
     Imperfection(
-        "kind of cell", "", (0, 1, 2, 3, 4), 2.0, 1.0, "rotators or retarders (other panels)",
+        "kind of cell", "", (0, 1, 2, 3, 4), 2.0, 1.0, "order rotators or retarders",
         lambda choice, stack: cell_choice(choice, stack.count),
         "retarders of one domain; twisted nematic at the first minimum; half-wave plates that turn (IPS)",
         choices=("rotators", "retarders", "twisted nematic", "half-wave plates", "these, alternately inverted"),
+        is_avoided=True,
     ),
     Imperfection(
-        "pixels", "", (0, 1, 2, 3), 3.0, 2.0, FEWER, _filters,
-        "a panel without filters shows one value for all colours, which is counted only if stack.colour says so",
-        choices=("no black lines", "no filters", "fewer filters", "filters on all"),
-    ),
-    Imperfection(
-        "diffraction at the pixels", "", (0, 1), 1.0, 1.0, "",
-        lambda choice, _: RealPanels(optics=Optics(diffracts=bool(choice), aperture=APERTURE)),
-        choices=("none", "at an open area of 60 %"),
+        "pixels", "", (0, 1, 2, 3), 3.0, 3.0, "", _pixels,
+        f"open area {APERTURE:.0%}; other filters need other panels and another stack.colour",
+        choices=("none", "diffraction", "and black lines", "and the stack's filters"),
     ),
     Imperfection(
         "haze of each panel", "%", (0, 1, 2, 5, 10, 25), 1.0, 1.0, "",
@@ -364,9 +369,8 @@ IMPERFECTIONS = (
         lambda percent, _: RealPanels(optics=Optics(reflectance=percent / 100)), "4.3 %: uncoated glass",
     ),
     Imperfection(
-        "light of the room", "lx", (0, 5, 10, 20, 50, 100), 10.0, 10.0, FEWER,
-        lambda lux, _: RealPanels(lighting=Lighting(room_lux=lux)),
-        "full white of 9 cd/m², then of 108 with filters on the rear alone", _brighter,
+        "light of the room", "lx", (0, 5, 10, 20, 50, 100), 10.0, 10.0, "", _room,
+        f"the rear monitor alone has {MONITOR_CD_M2:g} cd/m²",
     ),
     Imperfection(
         "backlight darker in the corners", "%", (0, 5, 10, 20, 30, 50), 20.0, 20.0, "",
@@ -381,7 +385,7 @@ IMPERFECTIONS = (
         late_front, "head moving at 0.1 m/s, 60 Hz", partial(late_front, allowed=True),
     ),
     Imperfection(
-        "update of a panel mounted upside down", "share of a refresh", (0, 0.25, 0.5, 0.75, 1), 0.0, 0.0, "",
-        _upside_down, "head moving at 0.1 m/s, 60 Hz",
+        "front panel upside down", "% of a refresh", (0, 25, 50, 75, 100), 0.0, 0.0, "",
+        _upside_down, "time from its first row's update, below, to its last one's; head moving at 0.1 m/s, 60 Hz",
     ),
 )  # fmt: skip

@@ -12,6 +12,7 @@ from textwrap import fill
 from typing import Any
 
 from runtime.config import ModelSettings, load_settings
+from runtime.errors import InputError
 from runtime.model.predictor import load_predictor
 from runtime.optics.quality import psnr_db
 from runtime.optics.real.cells import Cell, Curve
@@ -19,6 +20,7 @@ from runtime.optics.real.panels import RealPanels
 from runtime.optics.stack import PanelStack
 from runtime.report.crosstalk import (
     FALL_DB,
+    NEAR_M,
     Crosstalk,
     Patches,
     freedom_with_tracking,
@@ -30,26 +32,33 @@ from runtime.report.page import Figure, Page, PageSection, Table, describe, draw
 from runtime.report.pairs import PairPainter, StillPair, eyes_at, read_pairs
 from runtime.report.tolerance import (
     IMPERFECTIONS,
+    MONITOR_CD_M2,
     PIXELS,
     PIXELS_FIRST,
     Bench,
     Cost,
     PanelMaker,
     cell_at,
+    filters_of,
     late_front,
+    monitor_share,
     slow_panels,
     solved,
     together,
 )
+from runtime.report.tolerance_picture import seen_figure
 
 SCENE, DISTANCE_M, HEIGHT_M = "room", 0.6, 0.03  # content and head position without --pairs
+LOOKS = {33: "hard to distinguish from the target", 27: "a good picture with faint traces of the other layers",
+         21: "obvious ghosts and coloured edges", -math.inf: "the layers fall apart"}  # fmt: skip
 BACKLIGHT_FALLOFF = 0.2
 REFRESH_MS = 1e3 / 60
 CURVES: tuple[Curve, Curve] = ("intensity", "angle")  # grey curve calibrated without and with the angles
 Progress = Callable[[str], None]
 NOTE = (
     "No real stack has been measured. The figures come from a simulator of real panels that leaves out oblique "
-    "incidence in the cells, coherent effects between panels, spectra within a band and temperature (docs/planning.md)."
+    "incidence in the cells, coherent effects between panels, spectra within a band and temperature. The page Planning "
+    "a display in the documentation says what to order and what to measure first."
 )
 
 
@@ -62,22 +71,27 @@ class ToleranceRun:
         self.record: dict[str, Any] = {"complete": False}
         self._begun_s = time.perf_counter()
 
-    def run(self, config: Path | None, pairs: Path | None) -> dict[str, Any]:
+    def run(self, config: Path | None, pairs: Path | None, distance_m: float = DISTANCE_M) -> dict[str, Any]:
         """Measure everything, and return the contents of tolerance.json. Raises InputError for configuration
         or pairs, and MissingPart if a scene must be drawn without OpenGL.
         """
         self._progress("drawing the pictures")
-        stack = load_settings(config).stack.stack()
-        subjects_pairs = read_pairs(pairs) if pairs else [scene_pair(stack)]
-        stack = subjects_pairs[0].stack
+        if pairs:
+            subjects_pairs = read_pairs(pairs)
+            stack = subjects_pairs[0].stack
+        else:
+            stack = load_settings(config).stack.stack()
+            subjects_pairs = [scene_pair(stack, distance_m, source=config or "tolerance")]
         self._progress("solving")
         bench = Bench([solved(pair) for pair in subjects_pairs])
         self.record |= {"ideal_db": bench.ideal_db, "stack": geometry(stack), "pairs": [p.name for p in subjects_pairs]}
+        self.record["distance_m"] = [float(pair.eyes_m[:, 0].mean()) for pair in subjects_pairs]
         self._measure_costs(bench, stack, first=True)
         self._measure_compensation(bench)
         self._measure_crosstalk(stack, subjects_pairs[0])
         self._measure_costs(bench, stack, first=False)
         self._measure_freedom(bench, stack, drawn=pairs is None)
+        self._draw(bench)
         self.record |= {"complete": True, "seconds": time.perf_counter() - self._begun_s, "machine": describe()}
         self._write()
         return self.record
@@ -91,35 +105,48 @@ class ToleranceRun:
         pixels = PIXELS_FIRST if first else PIXELS
         self._progress("all imperfections together")
         both = [partial(together, IMPERFECTIONS, left=left) for left in (False, True)]
-        (assumed_db, brightness), (left_db, left_brightness) = bench.lights(both, pixels)
+        assumed_db, left_db = bench.lights(both, pixels)
         self.record["costs"] = [cost_entry(cost, bench.ideal_db) for cost in costs]
         self.record["together"] = {
-            "assumed_db": assumed_db, "left_db": left_db,
-            "assumed_brightness": brightness, "left_brightness": left_brightness,
+            "assumed": assumption(stack), "assumed_db": assumed_db, "left_db": left_db,
+            "monitor_share": monitor_share(stack), "white_cd_m2": MONITOR_CD_M2 * monitor_share(stack),
         }  # fmt: skip
-        self._sections["costs"] = cost_section(costs, bench.ideal_db, self.record["together"], is_first=first)
+        self._sections["costs"] = cost_section(costs, bench.ideal_db, is_first=first)
         self._write()
 
     def _measure_compensation(self, bench: Bench) -> None:
         self._progress("compensation")
         found = compensations()
-        lights = [light for light, _ in bench.lights([make for _, *both in found for make in both], PIXELS)]
+        lights = list(bench.lights([make for _, *both in found for make in both], PIXELS))
         rows: list[dict[str, Any]] = [
             {"name": name, "before_db": lights[2 * n], "after_db": lights[2 * n + 1]}
             for n, (name, _, _) in enumerate(found)
         ]
         self.record["compensation"] = rows
-        shown = [(row["name"], row["before_db"], row["after_db"]) for row in rows]
-        table = Table(
-            ["panels", "without, dB", "with, dB", "gained, dB"],
-            [[name, f"{before:.2f}", f"{after:.2f}", f"{after - before:.2f}"] for name, before, after in shown],
-        )
+        shown = [
+            [
+                row["name"],
+                f"{row['before_db']:.2f}",
+                f"{row['after_db']:.2f}",
+                f"{row['after_db'] - row['before_db']:.2f}",
+            ]
+            for row in rows
+        ]
+        angles = [row for row in shown if "full white" in row[0]]
+        tables = [
+            Table(
+                ["panels", "grey calibrated, 90 and 0 degrees assumed, dB", "and the angles given, dB", "gained, dB"],
+                angles,
+            ),
+            Table(["panels", "delay unknown to the alignment, dB", "known, dB", "gained, dB"], shown[len(angles) :]),
+        ]
         self._sections["compensation"] = PageSection(
             "Compensation",
-            ["calibrate grey takes black and full white for 0 and 90 degrees unless it is given the angles. With the "
-             "angles, every rotation within the panel's range is right. The alignment aims at the time when each panel "
+            ["First table: calibrate grey has measured the panels' grey curves (if not: Tolerances). It takes black "
+             "and full white for 0 and 90 degrees unless --white-deg and --black-deg give the angles; then every "
+             "rotation within the panel's range is right. Second table: the alignment aims at the time when each panel "
              "shows its picture, if delay_ms of a late panel and loop.scanout_ms (with the response) are set."],
-            tables=[table],
+            tables=tables,
         )  # fmt: skip
         self._write()
 
@@ -148,44 +175,92 @@ class ToleranceRun:
         subject = bench.subjects[0]
         self._progress("viewing freedom without tracking")
         still = freedom_without_tracking(subject.pair, subject.layers)
-        followed = []
+        followed: list[dict[str, float]] | None = None
         if drawn:
+            followed = []
             for place in freedom_with_tracking(stack, SCENE, lambda pair: psnr_db(solved(pair).ideal_error)):
                 followed.append(place)
                 self._progress(
                     f"viewing freedom with tracking: {place['distance_m']} m, {place['angle_deg']:g} degrees"
                 )
         self.record["viewing_freedom"] = {"without_tracking": still, "with_tracking": followed}
-        self._sections["freedom"] = freedom_section(still, followed)
+        self._sections["freedom"] = freedom_section(still, followed or ())
+
+    def _draw(self, bench: Bench) -> None:
+        self._progress("drawing what the left eye sees")
+        subject = bench.subjects[0]
+        both = [together(IMPERFECTIONS, subject.pair.stack, left=left) for left in (False, True)]
+        found = self.record["together"]
+        names = [
+            f"ideal panels, {bench.ideal_db:.1f} dB",
+            f"mounted by hand, {found['assumed_db']:.1f} dB",
+            f"and calibrated, {found['left_db']:.1f} dB",
+        ]
+        figure = seen_figure(subject, list(zip(names, (RealPanels(), *both), strict=True)))
+        self._sections["seen"] = PageSection("What the left eye sees", figures=[figure])
 
     def _write(self) -> None:
         if self._out is None:
             return
         done = self.record["complete"]
         notes = [NOTE] if done else ["This page is not finished; results are added as they come in.", NOTE]
-        lead = f"Light on ideal panels: {self.record['ideal_db']:.1f} dB, at a tracking error of 1 mm."
-        if found := self.record.get("together"):
-            lead += f" As ordered and mounted by hand: {found['assumed_db']:.1f} dB."
-            lead += f" After calibration, with the panels recommended below: {found['left_db']:.1f} dB."
+        lead = " ".join(summary(self.record))
         sections = [self._sections[name] for name in ORDER if name in self._sections]
         page = Page("What real panels would show", lead, sections, describe(), self._command, notes)
         page.write(self._out, data=self.record, data_name="tolerance.json")
 
 
-ORDER = ("costs", "compensation", "crosstalk", "freedom")
+ORDER = ("seen", "costs", "compensation", "crosstalk", "freedom")
 
 
-def scene_pair(stack: PanelStack) -> StillPair:
-    """Draw the built-in scene for a viewer in front of the stack."""
+def scene_pair(stack: PanelStack, distance_m: float = DISTANCE_M, source: str | Path = "tolerance") -> StillPair:
+    """Draw the built-in scene for a viewer in front of the stack. Raises InputError, which names `source`, if the front
+    panel is not in front of the viewer.
+    """
+    eyes_m = eyes_at(distance_m=distance_m, height_m=HEIGHT_M)
+    if eyes_m[:, 0].min() < stack.x_m[-1] + NEAR_M:
+        problem = f"the front panel is at {stack.x_m[-1]:g} m, but the viewer's eyes are at {eyes_m[:, 0].min():.3g} m"
+        raise InputError(source, "stack.x_m", problem)
     with PairPainter(SCENE, stack) as painter:
-        eyes_m = eyes_at(distance_m=DISTANCE_M, height_m=HEIGHT_M)
-        return painter.pair(f"{SCENE}, {DISTANCE_M:g} m", eyes_m, off_mm=())
+        return painter.pair(f"{SCENE}, {distance_m:g} m", eyes_m, off_mm=())
 
 
 def geometry(stack: PanelStack) -> dict[str, Any]:
     """Return a stack's geometry as entries for tolerance.json."""
     names = ("width_m", "height_m", "x_m", "width_px", "height_px")
-    return {name: getattr(stack, name) for name in names}
+    return {name: getattr(stack, name) for name in names} | {"colour": filters_of(stack)}
+
+
+def assumption(stack: PanelStack) -> str:
+    """Return in words which panels the figures for all imperfections together assume."""
+    coloured = [str(n) for n, has_filters in enumerate(filters_of(stack)) if has_filters]
+    filters = (
+        "all panels" if len(coloured) == stack.count else f"panel {' and '.join(coloured)}" if coloured else "no panel"
+    )
+    return f"cells that act as rotators, colour filters on {filters}, mounted by hand, not calibrated"
+
+
+def looks(light_db: float) -> str:
+    """Return what light looks like, in words."""
+    return next(words for least_db, words in LOOKS.items() if light_db > least_db)
+
+
+def summary(record: dict[str, Any]) -> list[str]:
+    """Return the main results in sentences."""
+
+    def told(light_db: float) -> str:
+        return f"{light_db:.1f} dB ({looks(light_db)})"
+
+    places = ", ".join(f"{metres:.2g} m" for metres in record["distance_m"])
+    lines = [f"Light on ideal panels, from {places}, at a tracking error of 1 mm: {told(record['ideal_db'])}."]
+    if found := record.get("together"):
+        lines += [
+            f"As assumed ({found['assumed']}): {told(found['assumed_db'])}.",
+            f"The same panels after registration and calibration: {told(found['left_db'])}.",
+            f"Full white is {found['monitor_share']:.0%} of the rear monitor's: {found['white_cd_m2']:.0f} cd/m² if "
+            f"that shows {MONITOR_CD_M2:.0f} cd/m².",
+        ]
+    return lines
 
 
 def compensations() -> list[tuple[str, PanelMaker, PanelMaker]]:
@@ -211,9 +286,9 @@ def cost_entry(cost: Cost, ideal_db: float) -> dict[str, Any]:
     one = cost.imperfection
     return {
         "name": one.name, "unit": one.unit, "sizes": one.sizes if cost.light_db else [], "light_db": cost.light_db,
-        "costs_1_db_at": cost.costs_1_db_at(ideal_db), "assumed": one.assumed,
+        "costs_1_db_at": cost.costs_1_db_at(ideal_db), "assumed": one.assumed, "choices": one.choices,
         "assumed_costs_db": ideal_db - cost.assumed_db, "remedy": one.remedy, "left_costs_db": ideal_db - cost.left_db,
-        "brightness": cost.brightness, "note": one.note,
+        "assumed_name": one.named(one.assumed), "note": one.note,
     }  # fmt: skip
 
 
@@ -222,7 +297,7 @@ def decibels(value: float) -> str:
     return f"{round(value, 1) + 0.0:.1f}"
 
 
-def cost_section(costs: Sequence[Cost], ideal_db: float, all_db: dict[str, float], *, is_first: bool) -> PageSection:
+def cost_section(costs: Sequence[Cost], ideal_db: float, *, is_first: bool) -> PageSection:
     """Return the table of imperfections, sorted by cost, with their curves."""
     ordered = sorted(costs, key=lambda cost: cost.assumed_db)
     rows = []
@@ -240,9 +315,8 @@ def cost_section(costs: Sequence[Cost], ideal_db: float, all_db: dict[str, float
         "only; all others concern every panel. Light is measured as in solve.json, with the same rays with and without "
         "the imperfection, at about "
         f"{PIXELS_FIRST if is_first else PIXELS} pixels of each picture at the panels' full resolution.",
-        f"All together as assumed: {all_db['assumed_db']:.1f} dB, with {100 * all_db['assumed_brightness']:.1f} % of "
-        f"the brightness of ideal panels. With all remedies: {all_db['left_db']:.1f} dB, with "
-        f"{100 * all_db['left_brightness']:.1f} %. Costs do not add up: diffraction and blur soften moiré.",
+        "Costs do not add up. Twisted nematic cells are left out of the figures for all together, because a stack "
+        "needs cells that act as rotators.",
     ]
     figures = [] if is_first else [cost_figure(ordered, ideal_db)]
     return PageSection("Tolerances", text, figures, [Table(headings, rows)])

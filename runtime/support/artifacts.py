@@ -132,10 +132,16 @@ def write_npy(path: Path, array: F32) -> None:
     write_bytes(path, buffer.getbuffer())
 
 
-def refuse_file(out: Path) -> None:
-    """Raise InputError if a file exists where the output folder must go."""
+def refuse_unwritable(out: Path) -> None:
+    """Raise InputError if an output folder cannot be written, before time is spent on its contents."""
     if out.exists() and not out.is_dir():
         raise InputError(out, "--out", "is a file; pass the name of a folder")
+    with suppress(_Tried), OutputFolder(out):
+        raise _Tried
+
+
+class _Tried(Exception):
+    """Leaves an output folder without writing to it."""
 
 
 class OutputFolder:
