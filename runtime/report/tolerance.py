@@ -104,8 +104,9 @@ class Cost:
 
 
 def solved(pair: StillPair, model: str = "balanced") -> Subject:
-    """Compute the layers for a pair, and their light on ideal panels. Light is compared with the pictures at the
-    panels' resolution, as `solve` does.
+    """Compute the layers for a pair, and their light on ideal panels.
+
+    Light is compared with the pictures at the panels' resolution, as `solve` does.
     """
     predictor = load_predictor(model, pair.stack, ModelSettings(backend="cpu"))
     try:
@@ -182,8 +183,9 @@ class Bench:
 
 
 def together(imperfections: Sequence[Imperfection], stack: PanelStack, *, left: bool) -> RealPanels:
-    """Return panels with all imperfections at their assumed sizes, or with what remedies leave of them. Those that are
-    avoided are left out.
+    """Return panels with all imperfections at their assumed sizes, or with what remedies leave of them.
+
+    Those that are avoided are left out.
     """
     real = RealPanels()
     for one in imperfections:

@@ -214,8 +214,9 @@ ORDER = ("seen", "costs", "compensation", "crosstalk", "freedom")
 
 
 def scene_pair(stack: PanelStack, distance_m: float = DISTANCE_M, source: str | Path = "tolerance") -> StillPair:
-    """Draw the built-in scene for a viewer in front of the stack. Raises InputError, which names `source`, if the front
-    panel is not in front of the viewer.
+    """Draw the built-in scene for a viewer in front of the stack.
+
+    Raises InputError, which names `source`, if the front panel is not in front of the viewer.
     """
     eyes_m = eyes_at(distance_m=distance_m, height_m=HEIGHT_M)
     if eyes_m[:, 0].min() < stack.x_m[-1] + NEAR_M:

@@ -1,4 +1,4 @@
-"""What an eye sees through real panels, as a picture."""
+"""Picture of what an eye sees through real panels."""
 
 from __future__ import annotations
 

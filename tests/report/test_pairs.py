@@ -61,7 +61,7 @@ def test_other_json_files_are_ignored_and_views_off_the_eyes_optional(tmp_path: 
         ({"eyes": [[-0.7, 0.0, 0.1], [0.7, 0.1, 0.1]]}, "in front of every panel"),
         ({"fov": 0}, "case.json: fov"),
         ({"fov": None}, "case.json: fov"),
-        ({"fovv": 30}, "case.json: fovv: is not a setting; did you mean fov"),
+        ({"fovv": 30}, "case.json: fovv: is not a setting: did you mean fov?"),
         ({"off": [{"mm": 2, "eye": [1, 2, 3], "image": "off.png", "x": 1}]}, "case.json: off.0.x"),
         ({"eyes": [[0.7, -32, 0.1], [0.7, 0.03, 0.1]]}, "case.json: eyes.1: is 32.03 m from the other eye"),
         ({"fov": 1e-320}, "case.json: fov"),
