@@ -183,7 +183,7 @@ PLACES = ((0.4, 0.0), (0.6, 0.0), (0.9, 0.0), (1.2, 0.0), (0.6, 20.0), (0.6, 40.
 def freedom_with_tracking(
     stack: PanelStack, scene: str, solve: Callable[[StillPair], float]
 ) -> Iterator[dict[str, float]]:
-    """Yield `distance_m`, `angle_deg` and `light_db` of `PLACES` in front of all panels, solved by `solve`."""
+    """Yield `distance_m`, `angle_deg` and `light_db`, by `solve`, at `PLACES` in front of the panels."""
     small = reduced(stack)
     with PairPainter(scene, replace(small)) as painter:
         for distance_m, angle_deg in PLACES:

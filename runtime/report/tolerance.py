@@ -28,6 +28,7 @@ from runtime.report.pairs import StillPair
 
 PIXELS = 4000  # pixels of a picture that are measured, about; a quarter of them at displaced eyes
 PIXELS_FIRST = 600  # for the first version of the page
+PASSED = 6.0  # rays that pass all panels in each set of a pixel's rays, about
 SIGMA_MM = 1.0
 HEAD_M_S = 0.1  # speed of the head where time matters
 Make = Callable[[float, PanelStack], RealPanels]
@@ -146,7 +147,8 @@ class Bench:
         for number, subject in enumerate(self.subjects):
             panels, sampling = make(subject.pair.stack), subject.sampling(pixels)
             if panels.optics.filters is not None:  # few rays pass, so trace more of them through fewer pixels
-                sampling = subject.sampling(pixels // 3)._replace(rays=16)
+                rays = math.ceil(math.sqrt(PASSED / panels.optics.passed))
+                sampling = subject.sampling(pixels // 3)._replace(rays=rays)
             key = (number, sampling)
             if key not in self._same_rays:
                 self._same_rays[key] = self._error(subject, RealPanels(), sampling)

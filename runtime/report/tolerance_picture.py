@@ -15,8 +15,8 @@ from runtime.records import F32
 from runtime.report.page import Figure, drawing, png
 from runtime.report.tolerance import Subject
 
-CROP_PX = (200, 150)  # width and height of the part in the middle of the left eye's picture that is shown
-RAYS_PASSED = 12  # rays per pixel that pass all panels, about
+CROP_PX = (160, 120)  # width and height of the part in the middle of the left eye's picture that is shown
+RAYS_PASSED = 6  # rays per pixel that pass all panels, about
 
 
 def seen_through(subject: Subject, real: RealPanels, rays: int = RAYS_PASSED) -> F32:
@@ -29,8 +29,7 @@ def seen_through(subject: Subject, real: RealPanels, rays: int = RAYS_PASSED) ->
     corner = np.array([(height - rows) // 2, (width - columns) // 2])
     v, u = np.mgrid[0:rows, 0:columns].reshape(2, -1) + corner[:, None]
     tables, light, white = Tables(subject.layers, stack, real), np.zeros((len(u), 3)), np.zeros((len(u), 3))
-    passed = math.prod(real.optics.aperture / (3 if filters else 1) for filters in real.optics.filters or ())
-    for _ in range(math.ceil(rays / passed)):
+    for _ in range(math.ceil(rays / real.optics.passed)):
         place = random.random((2, len(u)))
         radius = PUPIL_MM / 2e3 * np.sqrt(random.random(len(u)))
         angle = 2 * np.pi * random.random(len(u))

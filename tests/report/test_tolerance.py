@@ -18,7 +18,8 @@ import phasestack
 from runtime.commands.tolerance import told, tolerance
 from runtime.errors import InputError
 from runtime.optics.quality import psnr_db
-from runtime.optics.real.panels import Placement, RealPanels
+from runtime.optics.real.light import RealSampling
+from runtime.optics.real.panels import Optics, Placement, RealPanels
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
 from runtime.report.crosstalk import parallax_m, theory_percent, uniformity
@@ -131,6 +132,22 @@ def test_the_stacks_own_filters_are_assumed(colour: tuple[bool, ...], filters: t
         assert panels.lighting.white_cd_m2 == pytest.approx(300 * share)
     assert monitor_share(stack) == pytest.approx(share)
     assert all(f"{n}" in assumption(stack) for n in range(3) if filters[n]) or all(filters)
+
+
+def test_stacks_whose_pixels_pass_few_rays_are_measured_with_more(subject: Subject) -> None:
+    used = []
+
+    def counted(_: Subject, panels: RealPanels, sampling: RealSampling) -> float:
+        if panels.optics.filters is not None:
+            used.append(sampling.rays**2 * panels.optics.passed)
+        return 0.01
+
+    bench = Bench([subject])
+    bench._error = counted  # type: ignore[method-assign]
+    for filters in ((True,) * 3, (True, True, False), (False,) * 3):
+        bench.light(lambda _, f=filters: RealPanels(optics=Optics(filters=f, aperture=0.6)), 1500)  # type: ignore[misc]
+    assert len(used) == 3
+    assert all(6 <= rays < 9 for rays in used)
 
 
 def test_light_of_small_pictures_is_compared_at_the_panels_resolution(tmp_path: Path) -> None:

@@ -37,6 +37,11 @@ class Optics:
     aperture: float = 1.0  # open share of a subpixel's area
     reflectance: float = 0.0  # of each of the two surfaces that face each other across a gap
 
+    @property
+    def passed(self) -> float:
+        """Share of the rays of a colour that meet no black line and no filter of another colour."""
+        return math.prod(self.aperture / (3 if has_filters else 1) for has_filters in self.filters or ())
+
 
 @dataclass(frozen=True, slots=True)
 class Lighting:
