@@ -36,6 +36,8 @@ TRIED = (
     "a figure's age ticks on the page", "a head that moves has no figure, whatever the server says",
     "a lost connection is tried again", "and has ended after some seconds", "and is there again",
     "imperfect panels have no figure of their own", "and are ideal again",
+    "the figure stays in view at 1000 pixels", "side by side at 1000 pixels",
+    "the figure stays in view at 390 pixels", "side by side at 390 pixels",
     "eyes apart by -3 mm", "eyes apart by 0 mm", "eyes apart by 500 mm", "eyes apart by  mm",
     "a near head aside sees no sliver", "both eyes are described", "what was asked for is shown", "for this head",
     "another head has another target", "and the newest again", "the solver is held", "an old status does not undo it",

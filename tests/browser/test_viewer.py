@@ -211,6 +211,18 @@ def test_a_picture_is_as_wide_as_what_all_panels_show() -> None:
     assert found[1] == pytest.approx(STACK.height_m / 2 / rear_m, rel=0.05)
 
 
+@pytest.mark.parametrize("aside_m", [0.0, 0.1, 0.25])
+def test_a_display_is_drawn_larger_to_a_nearer_head(aside_m: float) -> None:
+    distances = np.array([1.2, 0.8, 0.6, 0.5, 0.4, 0.3, 0.2])
+    heads = [(x, aside_m * min(1.0, (x / 0.6) ** 2)) for x in distances]  # the way of `#nearer` in look.js
+    usual_m = float(np.hypot(0.6, aside_m))
+    cases = [[stack_table(STACK), [[x, y - 0.03, 0.1], [x, y + 0.03, 0.1]], usual_m, 1070, 868] for x, y in heads]
+    fov = np.radians(in_node("given.map((one) => fieldOfView(...one))", cases))
+    half_m = STACK.width_m / 2
+    angles = [np.arctan2(half_m - y, x) + np.arctan2(half_m + y, x) for x, y in heads]
+    assert (np.diff(np.tan(np.divide(angles, 2)) / np.tan(fov / 2)) > 0).all()
+
+
 def pair(stack: phasestack.Stack) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
     eyes = eyes_at(distance_m=0.7, angle_deg=6, height_m=0.1)
     with PairPainter("demo", stack) as painter:

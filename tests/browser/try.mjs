@@ -82,6 +82,22 @@ say("imperfect panels have no figure of their own", await until(async () => (awa
 await page.evaluate(() => document.querySelector(".built button").click()); // drawing keeps the page too busy for a pointer
 await page.uncheck("[data-key=pupil]");
 say("and are ideal again", await until(async () => /\d dB/.test(await light()) && !(await light()).includes("ideal")));
+await page.click("[data-mode=parallel]");
+for (const [width, height] of [[1000, 900], [390, 844]]) {
+  await page.setViewportSize({ width, height });
+  say(`the figure stays in view at ${width} pixels`, await until(() => page.evaluate(() => {
+    const built = document.querySelector(".built"), light = document.querySelector(".light");
+    built.open = true;
+    built.scrollIntoView({ block: "center" });
+    const { left, top } = light.getBoundingClientRect();
+    return document.elementFromPoint(left + 5, top + 5) === light;
+  })));
+  say(`side by side at ${width} pixels`, await until(() => page.evaluate(() => [...document.querySelectorAll(".names span")].map((one) => one.style.left).join() === "25%,75%")));
+  await page.screenshot({ path: `${folder}/built-${width}.png` });
+}
+await page.evaluate(() => { document.querySelector(".built").open = false; });
+await page.setViewportSize({ width: 640, height: 480 });
+await page.click("[data-mode=left]");
 for (const wrong of ["-3", "0", "500", ""]) {
   await page.fill("[name=ipd_mm]", wrong);
   await page.keyboard.press("Enter");

@@ -58,6 +58,13 @@ export function reach(stack, eyes) {
   return [0, 1].map((k) => Math.max(1e-3, ...found.map((one) => one[k])));
 }
 
+// Return the field of view in degrees of a picture in which the panels fill the canvas at the usual distance, are larger
+// when nearer, and smaller when farther.
+export function fieldOfView(stack, eyes, usual_m, width, height) {
+  const [across, up] = reach(stack, eyes), focal = 0.48 * Math.min(width / across, height / up) * Math.sqrt(usual_m / Math.hypot(...middle(eyes)));
+  return (Math.atan(width / 2 / focal) * 360) / Math.PI;
+}
+
 // Return the homography that maps a point (y, z, 1) on the ideal panel to the point on the tilted panel's layer that an
 // eye sees in the same direction, or null if the panel is not tilted. Twin of layer_from_seen in runtime/optics/tilt.py.
 function layerFromSeen(stack, n, eye) {

@@ -1,6 +1,6 @@
 // User interface for a page that shows a display: the head is moved with the pointer or keys, and there are viewing
 // modes and figures.
-import { Display, IDEAL, alignment, unaligned, panelDraws, drawPlan, middle, moved, reach, centre } from "/display.js";
+import { Display, IDEAL, alignment, unaligned, panelDraws, drawPlan, middle, moved, fieldOfView, centre } from "/display.js";
 
 const MODES = [ // key, name, group, hint
   ["wiggle", "Wiggle", "Eyes", "Alternates between the two eyes' pictures. The nearest parts jump the most."],
@@ -35,12 +35,12 @@ const BUILT = [
 const PAGE = `
 <div class="stage"><canvas tabindex="0" aria-label="What the eyes see. Arrow keys move the head; + and - move it nearer and farther."></canvas>
 <svg class="over" aria-hidden="true"></svg><div class="names" aria-hidden="true"></div><p class="notice" role="status" hidden></p></div>
-<aside><h1></h1><p class="how">Move your head with the pointer, a finger or the arrow keys. Scroll to move it nearer or farther.</p><div class="first"></div><div class="modes"></div><p class="hint"></p>
+<aside><h1></h1><p class="how">Move your head with the pointer, a finger or the arrow keys. Scroll to move it nearer or farther.</p><div class="now"><p class="light"></p><p class="head" role="status"></p></div><div class="first"></div><div class="modes"></div><p class="hint"></p>
 <div class="switches"><label><input type="checkbox" data-key="aligned" checked> outer panels follow the head</label>
 <label><input type="checkbox" data-key="pupil"> pupils 4 mm wide</label>
-<label class="slider"><span>focus, mm in front of the centre panel</span><input type="range" data-focus min="-150" max="150" step="5" value="0"><output>0</output></label><button type="button" class="quiet">Reset head</button></div>
+<label class="slider"><span>focus, mm in front of the middle panel</span><input type="range" data-focus min="-150" max="150" step="5" value="0"><output>0</output></label><button type="button" class="quiet">Reset head</button></div>
 <details class="built"><summary>As built</summary><p class="how">What imperfect panels would show. <code>phasestack tolerance</code> measures what each costs.</p><button type="button" class="quiet">Make the panels ideal</button></details>
-<p class="head" role="status"></p><p class="light"></p><div class="point"></div>
+<div class="point"></div>
 <div class="views"><figure><svg data-axis="1" viewBox="0 0 320 170" role="img" aria-label="Eyes and panels from above"></svg><figcaption>from above</figcaption></figure>
 <figure><svg data-axis="2" viewBox="0 0 320 170" role="img" aria-label="Eyes and panels from the side"></svg><figcaption>from the side</figcaption></figure></div>
 <div class="more"></div></aside>`;
@@ -70,7 +70,8 @@ export class Look {
     this.onchange = () => {}; // called when the picture must be drawn again
     this.onmode = () => {}; // called when a mode is chosen, with true if it needs target pictures
     this.$("h1").textContent = title;
-    this.$(".stage").style.setProperty("--aspect", this.stack.width_m / this.stack.height_m);
+    this.$(".light").hidden = !scene.picture;
+    root.style.setProperty("--aspect", this.stack.width_m / this.stack.height_m);
     this.#modes();
     this.#controls();
     new ResizeObserver(() => this.draw()).observe(this.canvas);
@@ -186,12 +187,8 @@ export class Look {
     return { width, height, resized };
   }
 
-  // Return a picture with a field of view wide enough for everything that the eyes solved for can see through all
-  // panels.
   #picture(width, height) {
-    const [across, up] = reach(this.stack, this.scene.eyes_m ?? this.eyes);
-    const focal = 0.48 * Math.min(width / across, height / up);
-    return { width, height, fov_deg: (Math.atan(width / 2 / focal) * 360) / Math.PI };
+    return { width, height, fov_deg: fieldOfView(this.stack, this.eyes, Math.hypot(...middle(this.eyesAt([0, 0, 0]))), width, height) };
   }
 
   get #focus_m() {
@@ -483,4 +480,4 @@ export class Look {
   }
 }
 
-const panelName = (n, count) => (n === 0 ? "rear panel" : n === count - 1 ? "front panel" : count === 3 ? "centre panel" : `panel ${n}`);
+const panelName = (n, count) => (n === 0 ? "rear panel" : n === count - 1 ? "front panel" : count === 3 ? "middle panel" : `panel ${n}`);
