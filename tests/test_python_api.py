@@ -592,6 +592,15 @@ def test_pairs_of_another_form_are_refused_by_name(pairs: Any, told: str) -> Non
         list(phasestack.solve_each(pairs, stack=STACK))
 
 
+def test_a_program_with_pytorch_ends_without_a_word() -> None:
+    """PyTorch keeps modules to the end, and nanobind reported them as leaked."""
+    pytest.importorskip("torch")
+    code = "import torch, phasestack as p; e = p.example_pair(); "
+    code += "r = p.solve(e.left, e.right, eyes_m=e.eyes_m, stack=e.stack, fov_deg=e.fov_deg, model='fast')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
 def test_without_stderr_pairs_are_solved_and_a_file_as_folder_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
