@@ -25,13 +25,14 @@ from runtime.optics.retina import as_codes, seen_by
 from runtime.report.pairs import PairPainter, eyes_at
 from runtime.report.tolerance import IMPERFECTIONS, solved, together
 from runtime.report.tolerance_page import scene_pair
-from runtime.report.tolerance_picture import CROP_PX, seen_through
+from runtime.report.tolerance_picture import seen_through
 from runtime.support.artifacts import write_png
 
 IMAGES = Path(__file__).resolve().parent / "images"
 LEFT, RIGHT, INK, SOFT = "#1f6fb4", "#d1661b", "#222222", "#8a8f98"
 FOV_DEG = 40.0
-RAYS_PASSED = 64  # rays per pixel that pass all panels, about
+CROP_PX = (240, 160)  # part of the left eye's picture, width and height
+RAYS_PASSED = 24  # rays per pixel that pass all panels, about
 
 
 def arrow(axes: Any, start: tuple[float, float], end: tuple[float, float]) -> None:
@@ -184,7 +185,7 @@ def as_built() -> Image.Image:
     sheet = Image.new("RGB", (len(kinds) * CROP_PX[0], CROP_PX[1]))
     draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(15)
     for n, (name, real) in enumerate(kinds.items()):
-        sheet.paste(Image.fromarray(as_codes(seen_through(subject, real, RAYS_PASSED))), (n * CROP_PX[0], 0))
+        sheet.paste(Image.fromarray(as_codes(seen_through(subject, real, RAYS_PASSED, CROP_PX))), (n * CROP_PX[0], 0))
         draw.text((n * CROP_PX[0] + 8, 6), name, fill="white", font=font, stroke_width=3, stroke_fill="black")
     return sheet
 

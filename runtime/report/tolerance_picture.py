@@ -19,13 +19,15 @@ CROP_PX = (160, 120)  # width and height of the part in the middle of the left e
 RAYS_PASSED = 6  # rays per pixel that pass all panels, about
 
 
-def seen_through(subject: Subject, real: RealPanels, rays: int = RAYS_PASSED) -> F32:
+def seen_through(
+    subject: Subject, real: RealPanels, rays: int = RAYS_PASSED, size_px: tuple[int, int] = CROP_PX
+) -> F32:
     """Return a crop of what the left eye sees through panels, relative to full white, from 0 to 1."""
     pair, random = subject.pair, np.random.default_rng(2)
     stack, eye_m, pose = pair.stack, pair.eyes_m[0], stack_from_eye(pair.eyes_m[0])
     height, width = pair.images[0].shape[:2]
     focal_px = image_from_camera(width_px=width, height_px=height, fov_deg=pair.fov_deg)[0, 0]
-    columns, rows = min(CROP_PX[0], width), min(CROP_PX[1], height)
+    columns, rows = min(size_px[0], width), min(size_px[1], height)
     corner = np.array([(height - rows) // 2, (width - columns) // 2])
     v, u = np.mgrid[0:rows, 0:columns].reshape(2, -1) + corner[:, None]
     tables, light, white = Tables(subject.layers, stack, real), np.zeros((len(u), 3)), np.zeros((len(u), 3))
