@@ -146,9 +146,8 @@ class Bench:
         errors = []
         for number, subject in enumerate(self.subjects):
             panels, sampling = make(subject.pair.stack), subject.sampling(pixels)
-            if panels.optics.filters is not None:  # few rays pass, so trace more of them through fewer pixels
-                rays = math.ceil(math.sqrt(PASSED / panels.optics.passed))
-                sampling = subject.sampling(pixels // 3)._replace(rays=rays)
+            if panels.optics.filters is not None:  # few rays pass, so trace more of them
+                sampling = sampling._replace(rays=math.ceil(math.sqrt(PASSED / panels.optics.passed)))
             key = (number, sampling)
             if key not in self._same_rays:
                 self._same_rays[key] = self._error(subject, RealPanels(), sampling)

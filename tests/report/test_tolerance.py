@@ -38,6 +38,7 @@ from runtime.report.tolerance import (
 )
 from runtime.report.tolerance_page import LOOKS, assumption, cost_entry
 from runtime.report.tolerance_picture import seen_through
+from tests.test_contracts import fields_of
 
 
 def command(*arguments: str) -> Any:
@@ -249,6 +250,8 @@ def test_a_run_leaves_its_page_and_figures(tmp_path: Path, monkeypatch: pytest.M
     assert done.exit_code == 0, done.output
     record = json.loads((tmp_path / "out" / "tolerance.json").read_text())
     assert record["complete"]
+    assert fields_of("field of tolerance.json") <= record.keys()
+    assert "%" in done.output
     for cost in record["costs"]:
         assert {"name", "unit", "assumed", "assumed_costs_db"} <= cost.keys()
         assert len(cost["sizes"]) == len(cost["light_db"])
