@@ -98,9 +98,11 @@ def stack_table(stack: PanelStack) -> dict[str, Any]:
 
 @cache
 def _script() -> str:
-    """Concatenate the JavaScript modules into one script, leaving out comments, imports and exports."""
+    """Concatenate the JavaScript modules into one script, leaving out comments, imports, exports and some spaces."""
     text = "\n".join(asset(name) for name in ("display.js", "look.js", "still.js"))
-    return re.sub(r"^ *//.*\n| +// .*$|^ +|^export |^import .*\n", "", text, flags=re.MULTILINE)
+    text = re.sub(r"^ *//.*\n| +// .*$|^ +|^export |^import .*\n", "", text, flags=re.MULTILINE)
+    operators = r"=>|===?|!==|=|&&|\|\||\?\?|\+=|<=|>="
+    return re.sub(rf"(?<=[\w)\]}}\"'`]) ({operators}) ", r"\1", text, flags=re.ASCII)
 
 
 def _exact(layer: U8, *, quick: bool) -> str:

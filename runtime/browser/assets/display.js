@@ -100,14 +100,10 @@ export function panelFromPicture(stack, n, eye, picture, nominal = eye) {
 }
 
 // Return the movement that several people share. Twin of common_movement_m in runtime/optics/alignment.py.
-function common(before, after) {
-  const both = (eyes, n) => middle([eyes[n - 1], eyes[n]]);
-  const steps = before.flatMap((_, n) => (n % 2 ? [both(after, n).map((v, k) => v - both(before, n)[k])] : []));
-  return [0, 1, 2].map((k) => {
-    const along = steps.map((step) => step[k]), least = Math.min(...along), most = Math.max(...along);
-    return least > 0 ? least : most < 0 ? most : 0;
-  });
-}
+const common = (before, after) => [0, 1, 2].map((k) => {
+  const steps = after.flatMap((eye, n) => (n % 2 ? [(eye[k] + after[n - 1][k] - before[n][k] - before[n - 1][k]) / 2] : []));
+  return Math.max(0, Math.min(...steps)) + Math.min(0, Math.max(...steps));
+});
 
 // Return the alignment of solved layers to other eyes of the same people. Twin of align in runtime/optics/alignment.py.
 // maps: for each panel, [scale u, scale v, shift u, shift v] from shown pixels to pixels of the solution.
