@@ -39,6 +39,16 @@ def broken(body: str, home: Path, **how: Any) -> subprocess.CompletedProcess[str
     return run("config", code=BROKEN.format(body=body), home=home, **how)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [("run --framez 3", "option: --framez (Possible"), ("calibrate solve", "option '--pairs'"), ("sovle", "'sovle'")],
+)
+def test_wrong_usage_is_one_line_and_2(arguments: str, told: str) -> None:
+    answer = run(*arguments.split())
+    assert answer.returncode == 2 and answer.stderr.startswith("phasestack: ") and told in answer.stderr
+    assert answer.stderr.count("\n") == 1 and answer.stderr.endswith(" --help`\n")
+
+
 @pytest.mark.parametrize("body", ["raise ValueError('two\\nlines\\0')", "(lambda f: f(f))(lambda f: f(f))"])
 def test_an_error_that_nobody_expected_is_one_line_a_file_and_70(tmp_path: Path, body: str) -> None:
     answer = broken(body, tmp_path)
