@@ -15,8 +15,8 @@ from runtime.records import F32
 from runtime.report.page import Figure, drawing, png
 from runtime.report.tolerance import Subject
 
-CROP_PX = (120, 80)  # width and height of the part in the middle of the left eye's picture that is shown
-RAYS_PASSED = 36  # rays per pixel that pass all panels, about
+CROP_PX = (160, 120)  # width and height of the part in the middle of the left eye's picture that is shown
+RAYS_PASSED = 18  # rays per pixel that pass all panels, about
 
 
 def seen_through(
