@@ -52,7 +52,7 @@ def begin(name: str, run: Callable[..., None], *args: Any) -> threading.Thread:
     try:
         thread.start()
     except RuntimeError as error:
-        raise TransientError(f"{name}: {error}") from error
+        raise TransientError(f"{name}: no thread can be started: too little memory, or too many threads") from error
     return thread
 
 
