@@ -117,7 +117,7 @@ class Changes:
         self.choices = Choices(presenter.state.settings)
         self.refused = ""  # why the latest change was refused; empty if it was accepted
         self._loading: _Loading | None = None
-        self._next: _Loading | None = None  # to start once the current change is over
+        self._waiting: list[_Loading] = []  # one for each command's name, to start once the current change is over
 
     @property
     def loading(self) -> str | None:
@@ -134,27 +134,29 @@ class Changes:
             if time.monotonic() - loading.begun_s > limit_s:
                 loading.begun_s = time.monotonic()
                 self._presenter.solver.restart("was ended because it took too long to load a scene or a model")
-        if self._loading is None and self._next is not None:
-            following, self._next = self._next, None
+        if self._loading is None and self._waiting:
+            following = self._waiting.pop(0)
             self.attempt(following.command, partial(self._load, following))
 
     def begin(self, command: Command, choose: Callable[[Choices], Choices], *, reload_content: bool = False) -> None:
-        """Start a change, or replace one that is still loading, and answer the command once it is over.
-        `choose` maps the current choices to the new ones, on the reading thread. `reload_content` reloads it in any
-        case.
+        """Start a change, and answer the command once it is over. It replaces one of the same command that is not over,
+        and waits for those of others. `choose` maps the current choices to the new ones, on the reading thread.
+        `reload_content` reloads it in any case.
         """
         following = _Loading(command, choose, reload_content)
         loading = self._loading
         if loading is None:
             self._load(following)
             return
-        for skipped in (None if loading.superseded else loading, self._next):
-            if skipped is not None:
-                self.answer(skipped.command, SUPERSEDED)
-        if not loading.superseded and loading.order is not None:
-            self._presenter.solver.send(Cancel(loading.order))
-        loading.superseded = True
-        self._next = following
+        replaced = [each for each in self._waiting if each.command.name == command.name]
+        if loading.command.name == command.name and not loading.superseded:
+            replaced.append(loading)
+            if loading.order is not None:
+                self._presenter.solver.send(Cancel(loading.order))
+            loading.superseded = True
+        for each in replaced:
+            self.answer(each.command, SUPERSEDED)
+        self._waiting = [*(each for each in self._waiting if each not in replaced), following]
 
     def place(self, command: Command) -> None:
         """Move the scene as requested, between two solutions. Raises InputError if the placement is invalid."""

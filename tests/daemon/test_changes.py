@@ -181,6 +181,14 @@ def test_a_newer_scene_overtakes_one_that_is_being_loaded(served: Served, gate: 
     assert served.rig.content.info.name == "sparse"
 
 
+def test_a_model_asked_for_while_a_scene_loads_waits_for_it(served: Served, gate: threading.Event) -> None:
+    first, answers = loading(served, "texture")
+    assert served.asked("model", "sart", meanwhile=gate.set)["ok"]
+    first.join(30.0)
+    status = served.status()
+    assert answers[0]["ok"] and (status["scene"], status["model"]) == ("texture", "sart")
+
+
 def test_a_place_given_while_the_scene_is_read_again_stays(served: Served, gate: threading.Event) -> None:
     first, answers = loading(served, "demo")
     assert served.asked("place", {"scale": 1.5})["placing"]["scale"] == 1.5
