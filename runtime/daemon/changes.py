@@ -141,8 +141,8 @@ class Changes:
     def begin(self, command: Command, choose: Callable[[Choices], Choices], *, reload_content: bool = False) -> None:
         """Start a change, and answer the command once it is over.
 
-        It replaces one of the same command that is not over, and waits for those of others. `choose` maps the current choices to the new ones, on the reading thread.
-        `reload_content` reloads it in any case.
+        It replaces one of the same command that is not over, and waits for those of others. `choose` maps the current
+        choices to the new ones, on the reading thread. `reload_content` reloads it in any case.
         """
         following = _Loading(command, choose, reload_content)
         loading = self._loading
