@@ -252,8 +252,12 @@ def summary(record: dict[str, Any]) -> list[str]:
     def told(light_db: float) -> str:
         return f"{light_db:.1f} dB ({looks(light_db)})"
 
-    places = ", ".join(f"{metres:.2g} m" for metres in record["distance_m"])
-    lines = [f"Light on ideal panels, from {places}, at a tracking error of 1 mm: {told(record['ideal_db'])}."]
+    places, stack = ", ".join(f"{metres:.2g} m" for metres in record["distance_m"]), record["stack"]
+    lines = [
+        f"{len(stack['x_m'])} panels of {stack['width_m']:g} x {stack['height_m']:g} m and {stack['width_px']} x "
+        f"{stack['height_px']} pixels, at {', '.join(f'{x:g}' for x in stack['x_m'])} m.",
+        f"Light on ideal panels, from {places}, at a tracking error of 1 mm: {told(record['ideal_db'])}.",
+    ]
     if found := record.get("together"):
         lines += [
             f"As assumed ({found['assumed']}): {told(found['assumed_db'])}.",

@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 
 import phasestack
 from runtime.commands.tolerance import told, tolerance
+from runtime.config import StackGeometry
 from runtime.errors import InputError
 from runtime.optics.quality import psnr_db
 from runtime.optics.real.light import RealSampling
@@ -36,7 +37,7 @@ from runtime.report.tolerance import (
     solved,
     together,
 )
-from runtime.report.tolerance_page import LOOKS, assumption, cost_entry
+from runtime.report.tolerance_page import LOOKS, assumption, cost_entry, geometry
 from runtime.report.tolerance_picture import seen_through
 from tests.test_contracts import fields_of
 
@@ -173,12 +174,14 @@ def test_the_terminal_names_choices_and_signs_no_zero() -> None:
         "costs": [cost_entry(cost, ideal_db) for cost in costs], "ideal_db": ideal_db, "distance_m": [0.6],
         "crosstalk": [{"patch_mm": mm, "percent": 5.0} for mm in (4.0, 500.0)], "full_field_crosstalk_percent": 90.0,
         "viewing_freedom": {"without_tracking": {"up": {"falls_3_db_at_mm": None, "mm": [0, 32]}}},
+        "stack": geometry(StackGeometry().stack()),
     }  # fmt: skip
     lines = "\n".join(told(record))
     assert "twisted nematic" in lines
     assert "kind of cell 2" not in " ".join(lines.split())
     assert "-0.0" not in lines
     assert "hard to distinguish" in lines
+    assert "3 panels of 0.5184 x 0.2916 m and 1920 x 1080 pixels, at -0.06, 0, 0.06 m." in lines
 
 
 def test_words_for_decibels_are_those_of_the_viewer() -> None:
