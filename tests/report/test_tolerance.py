@@ -179,7 +179,7 @@ def test_the_terminal_names_choices_and_signs_no_zero() -> None:
     lines = "\n".join(told(record))
     assert "twisted nematic" in lines
     assert "kind of cell 2" not in " ".join(lines.split())
-    assert "-0.0" not in lines
+    assert "-0.0 " not in lines
     assert "hard to distinguish" in lines
     assert "3 panels of 0.5184 x 0.2916 m and 1920 x 1080 pixels, at -0.06, 0, 0.06 m." in lines
 
