@@ -41,7 +41,7 @@ def broken(body: str, home: Path, **how: Any) -> subprocess.CompletedProcess[str
 
 @pytest.mark.parametrize(
     ("arguments", "told"),
-    [("run --framez 3", "option: --framez (Possible"), ("calibrate solve", "option '--pairs'"), ("sovle", "'sovle'")],
+    [("run --framez 3", "option: --framez (Possible"), ("calibrate solve", "option '--pairs'"), ("solv", "'solv'")],
 )
 def test_wrong_usage_is_one_line_and_2(arguments: str, told: str) -> None:
     answer = run(*arguments.split())
