@@ -69,9 +69,9 @@ def test_a_large_picture_is_measured_in_as_many_pixels_as_panels_have() -> None:
     """Twelve megapixels on small panels took a minute and 2 GB."""
     stack = PanelStack(0.5, 0.3, (-0.06, 0.0, 0.06), 480, 270)
     height, width, _ = on_panels_raster(np.zeros((300, 400, 3), np.uint8), stack).shape
-    assert (width / height, width * height) == (pytest.approx(4 / 3, rel=0.01), pytest.approx(300 * 400, rel=0.01))
+    assert width / height == pytest.approx(4 / 3, rel=0.01) and width * height == pytest.approx(300 * 400, rel=0.01)
     height, width, _ = on_panels_raster(np.zeros((1500, 2000, 3), np.uint8), stack).shape
-    assert (width / height, width * height) == (pytest.approx(4 / 3, rel=0.01), pytest.approx(480 * 270, rel=0.01))
+    assert width / height == pytest.approx(4 / 3, rel=0.01) and width * height == pytest.approx(480 * 270, rel=0.01)
 
 
 def solved(left: Path, right: Path) -> tuple[dict[str, Any], np.ndarray]:
