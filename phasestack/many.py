@@ -63,7 +63,7 @@ def solve_each(
     `progress` is shown on stderr. Raises ValueError, which names the pair and the argument, for an invalid one.
 
     Args:
-        executor: Any `concurrent.futures.Executor`, to solve several pairs at once with the same results; up to 64
+        executor: Any `concurrent.futures.Executor`, to solve several pairs in parallel with the same results; up to 64
             pairs are read ahead. A pair that fails does not end the others: its ValueError is yielded in place of a
             result and, with `progress`, printed as one line. If a pair's process dies and breaks the executor, the
             remaining pairs are solved in new processes, one after another.

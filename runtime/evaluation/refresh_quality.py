@@ -72,17 +72,17 @@ def measure_refresh(
     targets: RefreshTargets,
     stack: PanelStack,
     *,
-    quick: bool = False,
+    for_page: bool = False,
 ) -> RefreshQuality:
     """Measure a refresh's quality for all targets that were drawn, unless the eyes see no part of the
     panels. `carried` are the layers aligned as if all content were on the middle panel, and those before alignment;
-    None if more than a solution was shown. `quick` measures only the light at the aligned eyes, on fewer pixels,
+    None if more than a solution was shown. `for_page` measures only the light at the aligned eyes, on fewer pixels,
     against what these eyes should see.
     """
     errors = _live_errors(account, layers, targets, stack)
     error = float(np.mean(list(errors.values()))) if errors else None
     try:
-        moment, figures = _at_aligned_eyes(account, layers, carried, targets, stack, quick=quick)
+        moment, figures = _at_aligned_eyes(account, layers, carried, targets, stack, for_page=for_page)
     except ValueError as why:
         log.info("the quality of this refresh was not measured: %s", why)
         return RefreshQuality(live_error=error, people_errors=errors)
@@ -130,7 +130,7 @@ def _at_aligned_eyes(
     targets: RefreshTargets,
     stack: PanelStack,
     *,
-    quick: bool,
+    for_page: bool,
 ) -> tuple[Moment | None, dict[str, float]]:
     fov_deg, eyes = targets.fov_deg, solved_eyes_of(account)
     if carried is None or eyes is None or targets.solved is None or targets.used is None:
@@ -145,10 +145,10 @@ def _at_aligned_eyes(
         return carried_db(layers, pictures, stack, solved_for_m=drawn_for_m, eyes_m=seen_from_m, fov_deg=fov_deg)
 
     unseen = EyeViews((), targets.used, Quality(math.nan, math.nan, ()), stack, eyes_m, fov_deg)
-    views = unseen if quick else displayed(layers, targets.used, stack, eyes_m=eyes_m, fov_deg=fov_deg)
+    views = unseen if for_page else displayed(layers, targets.used, stack, eyes_m=eyes_m, fov_deg=fov_deg)
     thorough = ALIGNED_LARGE if targets.solved[0].size > PLENTY else ALIGNED
     # A live page compares what the panels show with what these eyes should see; reprojected content may be torn.
-    shown, drawn, drawn_for_m = (layers, targets.used, eyes_m) if quick else (aligned, targets.solved, solved_for_m)
+    shown, drawn, drawn_for_m = (layers, targets.used, eyes_m) if for_page else (aligned, targets.solved, solved_for_m)
     light = expected_psnrs_db(
         shown,
         drawn,
@@ -157,11 +157,11 @@ def _at_aligned_eyes(
         seen_from_m=eyes_m,
         sigmas_mm=(TRACKING_SIGMA_MM,),
         fov_deg=fov_deg,
-        sampling=QUICK if quick else thorough,
+        sampling=QUICK if for_page else thorough,
     )
     light_db = light[TRACKING_SIGMA_MM]
     moment = Moment(layers, views, light_db, (_line(account),), unaligned, solved_for_m, targets.solved)
-    if quick:
+    if for_page:
         return moment, {"light_db": light_db}
     values = [light_db, views.quality.psnr_db, views.quality.ssim]
     values.append(one_ray_db(aligned, targets.solved, drawn_for_m=solved_for_m, seen_from_m=eyes_m))

@@ -252,7 +252,7 @@ class QualitySampler:
             aligned = replace(frame, parallax=None)
             carried = shown_layers(aligned), shown_layers(replace(aligned, solved_from_shown=()))
         layers = shown_layers(frame)
-        quality = measure_refresh(account, layers, carried, targets, self._stack, quick=self._newest)
+        quality = measure_refresh(account, layers, carried, targets, self._stack, for_page=self._newest)
         if quality.moment is None:
             return quality
         moment = replace(

@@ -7,6 +7,16 @@ const { chromium } = find("playwright-core");
 
 export const say = (what, value = null) => console.log(JSON.stringify({ what, value }));
 
+// Wait until `holds` returns true, and return whether it did in time.
+export const until = async (holds, within_ms = 60000) => {
+  const end = Date.now() + within_ms;
+  while (Date.now() < end) {
+    if (await holds()) return true;
+    await new Promise((done) => setTimeout(done, 50));
+  }
+  return false;
+};
+
 export async function opened({ width = 1280, height = 800, origin = null, ...more } = {}) {
   const browser = await chromium.launch({
     executablePath: "/usr/bin/chromium",

@@ -1,5 +1,5 @@
 // node try.mjs URL FOLDER: `phasestack try` in Chromium; prints a line of JSON for each thing tried.
-import { opened, say } from "./chromium.mjs";
+import { opened, say, until } from "./chromium.mjs";
 
 const [, , url, folder] = process.argv;
 const origin = new URL(url).origin, token = new URL(url).searchParams.get("token");
@@ -8,14 +8,6 @@ const ask = (name) => fetch(`${origin}/now/${name}`, { headers: { Authorization:
 // Once more, as browsers do: on a busy machine, the server may have closed the idle connection that is used again.
 const now = async (name) => (await ask(name).catch(() => ask(name))).json();
 const status = () => now("status"), about = () => now("about");
-const until = async (holds, within_ms = 60000) => {
-  const end = Date.now() + within_ms;
-  while (Date.now() < end) {
-    if (await holds()) return true;
-    await new Promise((done) => setTimeout(done, 50));
-  }
-  return false;
-};
 const far = (a, b) => Math.hypot(...a.map((v, k) => v - b[k]));
 const off = (a, b) => Math.max(far(a[0], b[0]), far(a[1], b[1]));
 

@@ -1,19 +1,11 @@
 // node two.mjs URL FOLDER: two pages of `phasestack try` in Chromium are two people; prints a line of JSON for each thing.
-import { opened, say } from "./chromium.mjs";
+import { opened, say, until } from "./chromium.mjs";
 
 const [, , url, folder] = process.argv;
 const origin = new URL(url).origin, token = new URL(url).searchParams.get("token");
 const { browser, page: newPage, elsewhere, errors } = await opened({ origin, width: 640, height: 480 });
 const ask = () => fetch(`${origin}/now/status`, { headers: { Authorization: `Bearer ${token}` } });
 const status = async () => (await ask().catch(ask)).json();
-const until = async (holds, within_ms = 60000) => {
-  const end = Date.now() + within_ms;
-  while (Date.now() < end) {
-    if (await holds()) return true;
-    await new Promise((done) => setTimeout(done, 50));
-  }
-  return false;
-};
 const served = async () => ((await status()).people ?? []).length;
 const who = (page) => page.textContent(".who");
 const measured = (page) => until(async () => (await page.textContent(".head")) === "Measured for this position of the head.");
