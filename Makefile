@@ -75,6 +75,9 @@ package: $(VENV)/.test
 bench: $(VENV)/.test
 	$(BIN)/phasestack bench --out out/bench.json
 
+# Examples that no run before has tried.
+nightly coverage fuzz: export HYPOTHESIS_PROFILE = new
+
 # Every reader of untrusted bytes, some thousand bad files each; FUZZ_ARGS="-k gltf" for one of them.
 fuzz: $(VENV)/.test
 	FUZZ_EXAMPLES=$${FUZZ_EXAMPLES:-10000} $(BIN)/python -m pytest tests/fuzz -n $(TEST_WORKERS) --timeout 3600 $(FUZZ_ARGS)

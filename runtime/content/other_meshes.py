@@ -37,6 +37,7 @@ BEHIND_NUMBERS = re.compile(r"^([ \t]*(?:v|vt|vn|vp|f|l|p)[ \t][^#\n]*)#.*", re.
 COLOURED = re.compile(r"^v(?:[ \t]+[^\s#]+){6}", re.MULTILINE)
 UNCOLOURED_VERTEX = re.compile(r"^v(?:[ \t]+[^\s#]+){3}(?=[ \t\r]*$)", re.MULTILINE)
 COUNTS_BACK = re.compile(r"^[fl][ \t].*-", re.MULTILINE)
+BACKWARDS = re.compile(r"-[0-9]{1,9}")
 LIBRARIES = re.compile(r"^[ \t]*mtllib[ \t]+(.*\S)", re.MULTILINE)
 BETWEEN_LIBRARIES = re.compile(r"(?<=\.mtl)\s+", re.IGNORECASE)
 DRIVE = re.compile(r"[A-Za-z]:.*/")  # folder on the author's Windows machine, which is stripped from paths
@@ -174,9 +175,14 @@ def _counted(text: str) -> str:
         elif kind in ("f", "l") and "-" in line:
             total = tuple(counts.values())
             numbers = [zip(corner.split("/"), total, strict=False) for corner in corners]
-            ends = ["/".join(str(n + 1 + int(at)) if at[:1] == "-" else at for at, n in corner) for corner in numbers]
+            ends = ["/".join(_from_start(at, count) for at, count in corner) for corner in numbers]
             lines[place] = " ".join([kind, *ends])
     return "\n".join(lines)
+
+
+def _from_start(number: str, count: int) -> str:
+    """Number a vertex from the first instead of back from the last of `count`; what is no number stays."""
+    return str(count + 1 + int(number)) if BACKWARDS.fullmatch(number) else number
 
 
 def _wires(file: io.StringIO, origin: Origin) -> F32 | None:
