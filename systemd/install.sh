@@ -87,8 +87,6 @@ put 644 70-phasestack-sensors.rules /usr/lib/udev/rules.d/70-phasestack-sensors.
 put 755 x-authority /usr/lib/phasestack/x-authority
 put 755 back-off /usr/lib/phasestack/back-off
 put 644 ../docs/operation.md /usr/share/doc/phasestack/operation.md
-put 644 ../docs/page.md /usr/share/doc/phasestack/page.md
-put 644 ../docs/blackbox.md /usr/share/doc/phasestack/blackbox.md
 put 644 ../docs/install.md /usr/share/doc/phasestack/install.md
 put 644 ../docs/planning.md /usr/share/doc/phasestack/planning.md
 put 644 ../THIRD_PARTY.md /usr/share/doc/phasestack/THIRD_PARTY.md
