@@ -21,8 +21,6 @@ phasestack is licensed under Apache-2.0. It runs with the packages below, which 
 their licence texts in `*.dist-info`. `python docs/make_licences.py` writes this page from `requirements/runtime.lock`
 and the packages' metadata.
 
-| package | version | licence |
-| --- | --- | --- |
 """
 TAIL = """
 Wheels of binary packages bundle further libraries, each under the licence in that wheel's texts: among them
@@ -62,8 +60,8 @@ def licences(names: list[str]) -> list[dict[str, str]]:
 
 def page(packages: list[dict[str, str]]) -> str:
     """Format the page."""
-    rows = [[package[key].replace("|", "/") for key in ("Name", "URL", "Version", "License")] for package in packages]
-    return HEAD + "".join(f"| [{name}]({home}) | {' | '.join(rest)} |\n" for name, home, *rest in rows) + TAIL
+    rows = [f"* [{one['Name']}]({one['URL']}) {one['Version']}: {one['License']}\n" for one in packages]
+    return HEAD + "".join(rows) + TAIL
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ def plain(name: str) -> str:
 
 def listed() -> dict[str, list[str]]:
     """Home, version and licence by name, as the page has them."""
-    rows = re.findall(r"^\| \[(.+)\]\((.+)\) \| (.+) \| (.+) \|$", TEXT, re.MULTILINE)
+    rows = re.findall(r"^\* \[(.+)\]\((.+)\) (\S+): (.+)$", TEXT, re.MULTILINE)
     return {plain(name): rest for name, *rest in rows}
 
 
