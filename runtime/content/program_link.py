@@ -78,7 +78,7 @@ class FrameAnswer:
     """A frame's pictures, or why there are none."""
 
     number: int
-    pictures: Mapping[int, ProgramPicture | SharedPlace]  # keyed by side; empty: none
+    pictures: Mapping[int, SharedPlace]  # keyed by side; empty: none
     why: str
 
 
@@ -114,11 +114,7 @@ class LinkedServer:
             raise ContentFailure("the process that serves drawing programs does not answer")
         if not answer.pictures:
             raise ContentFailure(answer.why)
-        pictures = {
-            side: self._link.mapped(picture) if isinstance(picture, SharedPlace) else picture
-            for side, picture in answer.pictures.items()
-        }
-        return DrawnPictures(number, pictures)
+        return DrawnPictures(number, {side: self._link.mapped(place) for side, place in answer.pictures.items()})
 
     def close(self) -> None:
         self._link.close(self._port)

@@ -41,6 +41,12 @@ class ProgramPicture:
     depth: F32 | U16 | None  # (h, w) values of the depth buffer, or None if the program does not send it
     place: SharedPlace | None = None  # where the program has written it; None: it was sent
 
+    def replace(self, other: ProgramPicture) -> None:
+        """Overwrite the picture with another one of the same form."""
+        np.copyto(self.pixels, other.pixels)
+        if self.depth is not None and other.depth is not None:
+            np.copyto(self.depth, other.depth)
+
 
 @dataclass(frozen=True, slots=True)
 class DrawnPictures:

@@ -68,18 +68,23 @@ MESSAGE_MAX_BYTES = 8 * 7680 * 4320 + HEAD.size
 WRONG_DATA, LEAVING, TOO_BIG = 1007, 1001, 1009  # close codes of RFC 6455
 
 
-class _Memory:
+class ProgramMemory:
     """Memory that a program on the same machine can write its pictures to. A file in memory has no name, so it ends
     with the last process that uses it. The program opens it through this process's entry in /proc, which only the same
-    user can do.
+    user can do. The pictures of `SLOTS` frames fit into it, and those of later frames replace them.
     """
 
-    def __init__(self, size_bytes: int) -> None:
-        """Allocate the memory. Raises OSError if that is not possible."""
-        self._file = shared_memory("phasestack-program", size_bytes)
+    def __init__(self, picture_bytes: int) -> None:
+        """Allocate memory for pictures of at most this size. Raises OSError if that is not possible."""
+        self.picture_bytes, self.bytes = picture_bytes, 2 * SLOTS * picture_bytes
+        self._file = shared_memory("phasestack-program", self.bytes)
         self.path = f"/proc/{os.getpid()}/fd/{self._file}"
-        self.bytes = size_bytes
-        self.data = memoryview(mmap.mmap(self._file, size_bytes))  # unmapped once no picture refers to it
+        self._data = memoryview(mmap.mmap(self._file, self.bytes))  # unmapped once no picture refers to it
+
+    def place(self, frame: int, side: int, form: PictureForm) -> tuple[memoryview, SharedPlace]:
+        """Return the memory and the place of a picture of the frame with this number."""
+        at = (2 * (frame % SLOTS) + side) * self.picture_bytes
+        return self._data[at : at + form.bytes], SharedPlace(self.path, self.bytes, at, form)
 
     def close(self) -> None:
         """Close the file. Pictures in the memory remain valid."""
@@ -146,7 +151,7 @@ class _Client:
         self._scale = scale
         self._depth: np.dtype[Any] | None = None if depth is None else DEPTHS[depth]
         self._shares_memory, self._frames_shared = hello.get("memory", False), 0
-        self._memory: _Memory | None = None
+        self._memory: ProgramMemory | None = None
         self.unasked = 0  # consecutive pictures for an eye that was not asked for
         self._messages: deque[str] = deque(maxlen=1 if self.listens else 2 * IN_FLIGHT_MAX)
         self._has_messages = asyncio.Event()
@@ -158,29 +163,26 @@ class _Client:
 
     def request(self, number: int, frame: _Frame) -> None:
         """Leave a request for the program and, if it uses shared memory, choose the places of the pictures."""
-        asked, size_bytes = frame.asked, frame.form.bytes
-        eyes = list(asked.eyes)
-        if self._shares_memory and self._has_memory(2 * SLOTS * size_bytes):
+        asked, eyes = frame.asked, list(frame.asked.eyes)
+        if self._shares_memory and self._has_memory(frame.form.bytes):
             assert self._memory is not None
             self._frames_shared += 1
-            for n, (side, eye) in enumerate(zip(asked.sides, asked.eyes)):
-                at = (2 * (self._frames_shared % SLOTS) + side) * size_bytes
-                place = SharedPlace(self._memory.path, self._memory.bytes, at, frame.form)
-                frame.places[side] = self._memory.data[at : at + size_bytes], place
-                eyes[n] = eye | {"at": at}
+            for n, side in enumerate(asked.sides):
+                frame.places[side] = self._memory.place(self._frames_shared, side, frame.form)
+                eyes[n] = eyes[n] | {"at": frame.places[side][1].at}
         self.post(_message(number, asked, frame.form.width_px, frame.form.height_px, eyes))
 
-    def _has_memory(self, size_bytes: int) -> bool:
+    def _has_memory(self, picture_bytes: int) -> bool:
         """Ensure that there is enough shared memory, and tell the program if it is new."""
-        if self._memory is None or self._memory.bytes < size_bytes:
+        if self._memory is None or self._memory.picture_bytes < picture_bytes:
             self.close()
             try:
-                self._memory = _Memory(size_bytes)
+                self._memory = ProgramMemory(picture_bytes)
             except OSError as error:
                 log.warning("no memory can be shared with the program: %s", error.strerror)
                 self._shares_memory = False
                 return False
-            self.post(json.dumps({"memory": {"path": self._memory.path, "bytes": size_bytes}}))
+            self.post(json.dumps({"memory": {"path": self._memory.path, "bytes": self._memory.bytes}}))
         return True
 
     def close(self) -> None:

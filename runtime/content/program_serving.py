@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import secrets
 import threading
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 
@@ -18,8 +19,8 @@ from runtime.content.program_link import (
     ServerState,
     link,
 )
-from runtime.content.program_pictures import IN_FLIGHT_MAX
-from runtime.content.program_server import ProgramServer
+from runtime.content.program_pictures import IN_FLIGHT_MAX, PictureForm, ProgramPicture, SharedPlace
+from runtime.content.program_server import ProgramMemory, ProgramServer
 from runtime.errors import ContentFailure, InputError
 from runtime.support.channel import Channel
 
@@ -33,6 +34,9 @@ class Serving:
         self._addresses: dict[int, str] = {}  # address of the last server, keyed likewise
         self._told: dict[int, ServerState] = {}  # latest state sent, keyed likewise
         self._waiters = ThreadPoolExecutor(IN_FLIGHT_MAX + 1, "programs' answers")
+        self._lock = threading.Lock()  # for the fields below
+        self._memory: ProgramMemory | None = None  # for pictures that programs have sent
+        self._frames_shared = 0
 
     def take(self, timeout_s: float) -> None:
         """Carry out the solver's instructions that have arrived, or wait for one."""
@@ -43,6 +47,8 @@ class Serving:
                     self._send(self._opened(port, self._addresses.get(port, "")))
                 case CloseServer(port) if port in self._servers:
                     self._servers.pop(port).close()
+                    with self._lock:
+                        self._release()
                 case AskFrame():
                     self._ask(message)
         for port, server in self._servers.items():
@@ -72,11 +78,35 @@ class Serving:
 
     def _answer(self, ask: AskFrame, server: ProgramServer, number: int) -> None:
         try:
-            pictures, why = server.drawn(number).pictures, ""
-        except ContentFailure as error:
+            pictures, why = self._in_memory(server.drawn(number).pictures), ""
+        except (ContentFailure, OSError) as error:
             pictures, why = {}, str(error)
         self._tell(ask.port, server)
-        self._send(FrameAnswer(ask.number, {side: picture.place or picture for side, picture in pictures.items()}, why))
+        self._send(FrameAnswer(ask.number, pictures, why))
+
+    def _in_memory(self, pictures: Mapping[int, ProgramPicture]) -> dict[int, SharedPlace]:
+        """Return where pictures are in shared memory, after copying those that were sent. Raises OSError.
+
+        Memory that is used again takes a third of the time that new memory in each message would.
+        """
+        places = {side: picture.place for side, picture in pictures.items() if picture.place is not None}
+        with self._lock:
+            self._frames_shared += 1
+            for side in pictures.keys() - places.keys():
+                picture, (height_px, width_px) = pictures[side], pictures[side].pixels.shape[:2]
+                depth = None if picture.depth is None else picture.depth.dtype
+                form = PictureForm(width_px, height_px, depth, bottom_up=False)
+                if self._memory is None or self._memory.picture_bytes < form.bytes:
+                    self._release()
+                    self._memory = ProgramMemory(form.bytes)
+                memory, places[side] = self._memory.place(self._frames_shared, side, form)
+                form.picture(memory).replace(picture)
+        return places
+
+    def _release(self) -> None:
+        if self._memory is not None:
+            self._memory.close()
+            self._memory = None
 
     def _tell(self, port: int, server: ProgramServer) -> None:
         state = ServerState(port, server.problem, server.frame_ms)

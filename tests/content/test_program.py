@@ -327,11 +327,17 @@ def test_connections_are_accepted_again_after_too_many_open_files(source: Any, c
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     with caplog.at_level("ERROR", logger="asyncio"):
         resource.setrlimit(resource.RLIMIT_NOFILE, (client.fileno() + 1, limits[1]))
+        taken = []
         try:
+            with suppress(OSError):
+                while True:
+                    taken.append(os.dup(0))
             client.connect(("127.0.0.1", urlsplit(source.program["address"]).port))
             assert eventually(lambda: "out of system resource" in caplog.text)
         finally:
             resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+            for file in taken:
+                os.close(file)
     client.close()
     program = Program(source)
     assert len(drawn(source)) == 2
@@ -498,6 +504,23 @@ def test_a_program_on_the_same_machine_may_share_memory(either: Any) -> None:
     either.close()
     del program.memory  # the client's own mapping
     assert eventually(lambda: open_memories() == 0)
+
+
+@pytest.mark.parametrize("kind", [Program, Sharing])
+def test_pictures_stay_while_smaller_ones_of_later_frames_arrive(either: Any, kind: type[Program]) -> None:
+    program = kind(either)
+
+    def right_picture(width_px: int, height_px: int) -> np.ndarray:
+        views = raster_views(EYES, replace(STACK, width_px=width_px, height_px=height_px).panel(0))
+        either.expect(views, time_ns=0)
+        return either.render(views[1], time_ns=0)
+
+    for _ in range(program_server.SLOTS):
+        kept = right_picture(64, 36)
+    for _ in range(2):
+        right_picture(60, 34)
+    assert (kept[..., 0] == 100).all() and (kept[:, 5, 1] == np.arange(36)).all()
+    program.end()
 
 
 def open_memories() -> int:
