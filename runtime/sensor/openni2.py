@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import logging
 import math
-import queue
-import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -30,9 +27,6 @@ THREADS_STOP_S = 0.5  # fifteen periods of a recording's threads; three periods 
 DRAIN_MAX = 32  # maximum number of frames to skip per call, because a fast source could otherwise block the call
 
 log = logging.getLogger(__name__)
-T = TypeVar("T")
-_idle: list[_PersistentThread] = []  # threads for reuse; a thread that hangs is never returned to the list
-_lock = threading.Lock()
 
 
 class _Picture(NamedTuple):
@@ -43,8 +37,8 @@ class _Picture(NamedTuple):
 
 class OpenNI2Driver(Sensor):
     """Driver for OpenNI2 cameras that delivers colour frames as well as depth frames in millimetres.
-    Depth is registered to colour if the camera supports it. All calls into the library run on a `_PersistentThread`,
-    which outlives the calling thread.
+    Depth is registered to colour if the camera supports it. For use on a process's main thread only: at exit, the
+    library accesses the stack of every thread that has called it.
     """
 
     name = "openni2"
@@ -53,7 +47,6 @@ class OpenNI2Driver(Sensor):
     def __init__(self, settings: SensorSettings, clock: Clock) -> None:
         """Store the settings. `source` is a serial number, a device URI, a `.oni` file, or the only camera."""
         self._settings, self._clock = settings, clock
-        self._thread: _PersistentThread | None = None  # None if not open
         self._openni: Any = None
         self._device: Any = None
         self._streams: dict[str, Any] = {}
@@ -64,15 +57,6 @@ class OpenNI2Driver(Sensor):
 
     def open(self) -> None:
         self.close()
-        with _lock:
-            self._thread = thread = _idle.pop() if _idle else _PersistentThread("openni2")
-        try:
-            thread(self._open)
-        except BaseException:
-            self.close()
-            raise
-
-    def _open(self) -> None:
         source = self._settings.source
         if source.endswith(".oni") and not Path(source).is_file():
             raise InputError(source, "", "does not exist or is not a file")
@@ -80,9 +64,10 @@ class OpenNI2Driver(Sensor):
         try:
             self._device = self._find_device()
             self._start_streams()
-        except SensorLost:
-            raise
         except Exception as error:  # the package raises its own exceptions, ctypes exceptions and AssertionError
+            self.close()
+            if isinstance(error, SensorLost):
+                raise
             raise SensorLost(f"OpenNI2: {_text(error)}") from None
 
     def _find_device(self) -> Any:
@@ -153,11 +138,8 @@ class OpenNI2Driver(Sensor):
         return replace(camera, fy_px=camera.height_px / 2 / math.tan(fov_y / 2))
 
     def read_newest(self, timeout_s: float) -> SensorFrame:
-        if self._thread is None:
+        if self._device is None:
             raise SensorLost("OpenNI2: the camera is not open")
-        return self._thread(lambda: self._read_newest(timeout_s))
-
-    def _read_newest(self, timeout_s: float) -> SensorFrame:
         deadline_ns = self._clock.now_ns() + round(timeout_s * NS_PER_S)
         before = self._newest.get(self._main)
         while self._newest.get(self._main) is before:
@@ -219,13 +201,6 @@ class OpenNI2Driver(Sensor):
         raise SensorTimeout(f"no frame arrived for {timeout_s:g} s")
 
     def close(self) -> None:
-        thread, self._thread = self._thread, None
-        if thread is not None:
-            thread(self._close)
-            with _lock:
-                _idle.append(thread)
-
-    def _close(self) -> None:
         streams, self._streams = self._streams, {}
         device, self._device = self._device, None
         for stream in streams.values():
@@ -280,31 +255,3 @@ def _pixels(frame: Any) -> U8 | U16:
     if channels == 1:
         return np.repeat(rows[..., None], 3, axis=2)
     return rows.reshape(height, width, 3).copy()
-
-
-class _PersistentThread:
-    """Thread that lives as long as the process and runs calls one at a time. Callers wait for the result.
-
-    At exit, OpenNI2 accesses every thread that has ever called the library, and crashes if such a thread's stack has
-    been freed. A `ThreadPoolExecutor` is not suitable, because Python ends the pool's threads earlier and waits for
-    threads that hang in a call.
-    """
-
-    def __init__(self, name: str) -> None:
-        self._calls: queue.SimpleQueue[tuple[Future[Any], Callable[[], Any]]] = queue.SimpleQueue()
-        threading.Thread(target=self._run, name=name, daemon=True).start()
-
-    def __call__(self, call: Callable[[], T]) -> T:
-        """Run a call and return its result or raise its exception."""
-        outcome: Future[T] = Future()
-        self._calls.put((outcome, call))
-        return outcome.result()
-
-    def _run(self) -> None:
-        while True:
-            outcome, call = self._calls.get()
-            try:
-                outcome.set_result(call())
-            except BaseException as error:  # raised again in the caller
-                outcome.set_exception(error)
-            del outcome, call  # otherwise objects would stay alive until the next call

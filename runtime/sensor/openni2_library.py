@@ -7,12 +7,9 @@ threads running after closing a device, and unloading their code would crash the
 
 from __future__ import annotations
 
-import atexit
 import ctypes
 import os
-import shutil
 import tempfile
-import threading
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +26,6 @@ LIBRARY_FOLDERS = (
 DUMMY = "DummyDevice"  # OpenNI2's sample driver, which would add a fake device
 INSTALL = "OpenNI2 was not found; install libopenni2-0 or set sensor.openni2_folder"
 
-_lock = threading.Lock()
 _loaded = False
 
 
@@ -52,12 +48,11 @@ def load(folder: str = "") -> Any:
         from openni import openni2
     except ImportError as error:
         raise missing_extra(error) or error from None
-    with _lock:
-        if _loaded:
-            return openni2
-        library, drivers = find_library(folder)
-        links = Path(tempfile.mkdtemp(prefix="phasestack-openni2-"))
-        atexit.register(shutil.rmtree, links, ignore_errors=True)
+    if _loaded:
+        return openni2
+    library, drivers = find_library(folder)
+    with tempfile.TemporaryDirectory(prefix="phasestack-openni2-") as folder_of_links:
+        links = Path(folder_of_links)
         (links / "OpenNI2" / "Drivers").mkdir(parents=True)
         (links / "libOpenNI2.so").symlink_to(library)
         for file in sorted(drivers.glob("lib*.so*")):
@@ -71,5 +66,5 @@ def load(folder: str = "") -> Any:
             raise SensorLost(f"OpenNI2 failed to start: {error}") from None
         for file in (links / "OpenNI2" / "Drivers").iterdir():
             ctypes.CDLL(str(file), mode=os.RTLD_NOW | os.RTLD_NODELETE)
-        _loaded = True
-        return openni2
+    _loaded = True
+    return openni2

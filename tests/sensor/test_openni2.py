@@ -101,38 +101,6 @@ def test_without_a_camera_it_is_lost_and_names_the_serial() -> None:
     assert "no OpenNI2 camera" in answer.stdout and "SERIAL-1" in answer.stdout
 
 
-ENDED_THREADS = """
-import threading
-from runtime.clock import MonotonicClock
-from runtime.config import SensorSettings
-from runtime.errors import SensorLost
-from runtime.sensor.openni2 import OpenNI2Driver
-def look_for_a_camera():
-    for _ in range(3):
-        try:
-            OpenNI2Driver(SensorSettings(driver="openni2"), MonotonicClock()).open()
-        except SensorLost as error:
-            print(error)
-def ended(*threads):
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-for _ in range(3):
-    ended(threading.Thread(target=look_for_a_camera))
-together = threading.Barrier(20)  # more stacks at once than the system keeps for later
-ended(*(threading.Thread(target=together.wait) for _ in range(20)))
-"""
-
-
-def test_a_process_whose_reading_threads_have_ended_ends_well() -> None:
-    """Seen: `setup`, in which a camera was looked for twice, ended in a segmentation fault of the library's."""
-    for _ in range(3):
-        answer = subprocess.run([sys.executable, "-c", ENDED_THREADS], capture_output=True, timeout=60, text=True)
-        assert answer.returncode == 0, answer.stderr
-        assert answer.stdout.count("no OpenNI2 camera found") == 9
-
-
 PLAYED_TO_THE_END = """
 import sys
 from runtime.clock import MonotonicClock
