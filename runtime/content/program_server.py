@@ -69,9 +69,11 @@ WRONG_DATA, LEAVING, TOO_BIG = 1007, 1001, 1009  # close codes of RFC 6455
 
 
 class ProgramMemory:
-    """Memory that a program on the same machine can write its pictures to. A file in memory has no name, so it ends
-    with the last process that uses it. The program opens it through this process's entry in /proc, which only the same
-    user can do. The pictures of `SLOTS` frames fit into it, and those of later frames replace them.
+    """Memory that a program on the same machine can write its pictures to.
+
+    A file in memory has no name, so it ends with the last process that uses it. The program opens it through this
+    process's entry in /proc, which only the same user can do. The pictures of `SLOTS` frames fit into it, and those of
+    later frames replace them.
     """
 
     def __init__(self, picture_bytes: int) -> None:
