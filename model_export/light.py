@@ -1,13 +1,14 @@
 """Compute the light at the eyes, and the solver's steps, as differentiable torch functions.
 
 Networks are trained by backpropagating through these functions, and the runtime is tested against them. The equations
-are the ones in docs/mathematics.md, "A step". Each function is the twin of one in `runtime`:
+are the ones in docs/mathematics.md, "A step". The functions mirror these, which they share only homographies with:
 
-    Views.of      model/geometry.py: Geometry.panels_from_rays; optics/light.py: panels_from_centre
-    light, step   kernels/solver.cpp: a step's rays, gradient and curvature
-    traced        kernels/light.cpp: see, along random rays
-    light_db      optics/light.py: squared_errors, for pinhole eyes
-    improved      model/solver.py: the steps after the network
+    Views.of   of pictures: optics/light.py, squared_errors; of steps: model/geometry.py, Geometry.ray_sets
+    light      kernels/solver.cpp, to_phasors and compare; model/gl/shaders/compare.frag.glsl
+    step       kernels/solver.cpp, step; model/gl/shaders/compare.frag.glsl, sets.glsl and move.frag.glsl
+    improved   model/solver.py, StepPredictor.solve, from a network's panels
+    traced     kernels/light.cpp, see; optics/retina.py, through_layers of boxes; browser/assets/display.js
+    light_db   optics/light.py, squared_errors, for pinhole eyes
 
 *Light.* Panel n shows x_n in [0, 1]. Along a ray, s is the sum of x_n, and the intensity is I = sin²(pi/2·s) =
 (1 - Re exp(i·pi·s))/2. A pixel of an eye's picture is a bundle of rays. Within a bundle, the values on different panels

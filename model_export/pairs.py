@@ -23,10 +23,11 @@ from runtime.content.placed import Placing, placed_source
 from runtime.content.presets import preset_names
 from runtime.content.registry import open_content
 from runtime.errors import InputError
+from runtime.model.warp import resample
 from runtime.optics.malus import phase_from_intensity
-from runtime.optics.stack import PanelStack, between_pixel_centres
+from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_raster, image_from_stack, stack_from_eye
-from runtime.records import F32, F64, U8
+from runtime.records import F32
 from runtime.support.gl import offscreen_context
 from runtime.support.picture_file import read_image
 
@@ -128,7 +129,8 @@ def photographed(pair: Pair, stack: PanelStack, fov_deg: float) -> TrainingPair:
         picture = np.asarray(cv2.resize(read_image(pair.paths[side]), size_px, interpolation=cv2.INTER_AREA), np.uint8)
         drawn = pair.image_from_stack(side, **size, fov_deg=fov_deg)
         straight = image_from_stack(eye_m, **size, fov_deg=fov_deg)
-        images.append(_warped(picture, drawn[:, :3] @ np.linalg.inv(straight[:, :3]), stack, cv2.BORDER_REPLICATE))
+        picture_from_straight = drawn[:, :3] @ np.linalg.inv(straight[:, :3])
+        images.append(resample(picture, picture_from_straight, size=size_px[::-1], edge=cv2.BORDER_REPLICATE))
     return TrainingPair(stack, pair.eyes_m, (images[0], images[1]), fov_deg)
 
 
@@ -143,14 +145,7 @@ def network_input(pair: TrainingPair, form: Form) -> F32:
         for eye_m, image in zip(pair.eyes_m, pair.images, strict=True):
             size = {"width_px": image.shape[1], "height_px": image.shape[0]}
             projection = image_from_stack(eye_m, **size, fov_deg=pair.fov_deg)
-            warped = _warped(image, image_from_raster(projection, stack.panel(n)), stack, border)
+            picture_from_panel = image_from_raster(projection, stack.panel(n))
+            warped = resample(image, picture_from_panel, size=(stack.height_px, stack.width_px), edge=border)
             channels.append(table[warped].transpose(2, 0, 1))
     return np.concatenate(channels)
-
-
-def _warped(picture: U8, picture_from_raster: F64, stack: PanelStack, border: int) -> U8:
-    """Resample a picture bilinearly to a panel's pixels, with OpenCV's border mode outside."""
-    matrix = between_pixel_centres(picture_from_raster)
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    size = stack.width_px, stack.height_px
-    return np.asarray(cv2.warpPerspective(picture, matrix, size, flags=flags, borderMode=border), np.uint8)

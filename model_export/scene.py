@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from runtime.optics.stack import PanelStack
+from runtime.optics.stack import PanelStack, between_pixel_centres
 from runtime.records import F32, F64, U8
 
 FINER = 2  # supersampling factor for antialiasing
@@ -69,9 +69,9 @@ def _draw_plane(texture: U8, raster_from_plane: F64, part: tuple[slice, slice], 
     left, top = columns.start, rows.start
     height, width = texture.shape[:2]
     texels = raster_from_plane @ np.diag([1 / width, 1 / height, 1.0])
-    # OpenCV puts pixel centres at integers.
-    shifted = _shift(-0.5 - left, -0.5 - top) @ texels @ _shift(0.5, 0.5)
-    drawn = cv2.warpPerspective(texture, shifted, (columns.stop - left, rows.stop - top), flags=cv2.INTER_LINEAR)
+    part_from_texels = np.array([[1.0, 0.0, -left], [0.0, 1.0, -top], [0.0, 0.0, 1.0]]) @ texels
+    size = columns.stop - left, rows.stop - top
+    drawn = cv2.warpPerspective(texture, between_pixel_centres(part_from_texels), size, flags=cv2.INTER_LINEAR)
     inverse = np.linalg.inv(raster_from_plane)
     u, v = np.arange(left, columns.stop) + 0.5, np.arange(top, rows.stop)[:, None] + 0.5
     # When a pixel is mapped back to the plane, the third coordinate is the reciprocal of its distance along the gaze.
@@ -80,11 +80,6 @@ def _draw_plane(texture: U8, raster_from_plane: F64, part: tuple[slice, slice], 
     alpha *= near >= nearness[part]
     picture[part] += alpha[..., None] * (drawn[..., :3].astype(np.float32) - picture[part])
     np.copyto(nearness[part], near, where=alpha > 0.5)
-
-
-def _shift(right: float, down: float) -> F64:
-    """Return the 3x3 homography that translates by a number of pixels."""
-    return np.array([[1.0, 0.0, right], [0.0, 1.0, down], [0.0, 0.0, 1.0]])
 
 
 def random_scene(random: Random, stack: PanelStack, middle_m: F64) -> Scene:

@@ -34,7 +34,7 @@ from runtime.optics.cameras import as_cameras, doubts, looking_at_origin
 from runtime.optics.disparity import disparity_doubts
 from runtime.optics.real.light import RealSampling, Sight, real_light
 from runtime.optics.real.panels import RealPanels
-from runtime.optics.retina import seen_by
+from runtime.optics.retina import sees_panels
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack
 from runtime.records import F32, F64, U8
@@ -452,8 +452,7 @@ def _checked(
     for line in doubts(eyes, stack, fov_deg=fov_deg, size=(pictures[0].shape[1], pictures[0].shape[0])):
         warnings.warn(line, stacklevel=3)
     pair = _Pair(tuple(pictures), eyes, stack, fov_deg, is_resampled=cameras is not None)
-    black = np.zeros((stack.count, stack.height_px, stack.width_px, 3), np.uint8)
-    if not all(seen_by(eye, black, stack, fov_deg=fov_deg, width_px=64, height_px=64).mask.any() for eye in eyes):
+    if not all(sees_panels(eye, stack, fov_deg=fov_deg) for eye in eyes):
         raise ValueError(
             "eyes_m: at least one eye cannot see any part of the display; move the eyes in front of the panels"
         )

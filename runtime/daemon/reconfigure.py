@@ -11,7 +11,7 @@ from runtime.content.placed import placed_source, placing_of
 from runtime.content.registry import Opener, prepare_content
 from runtime.errors import PhasestackError, Stopped
 from runtime.frame.run_state import SceneCell
-from runtime.model.base import trial_eyes_m
+from runtime.model.base import warm_up
 from runtime.model.buffers import LayerSlots
 from runtime.model.device import SolverBackend
 from runtime.model.predictor import SHIPPED, Predictor, load_predictor
@@ -149,7 +149,7 @@ def ready_predictor(
         predictor = predictor.bound(slots=slots)
     try:
         if warmed:
-            predictor.warm_up(trial_eyes_m(stack))
+            warm_up(predictor)
     except BaseException:
         predictor.close()
         raise

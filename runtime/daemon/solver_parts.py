@@ -33,7 +33,7 @@ from runtime.frame.run_state import SceneCell
 from runtime.frame.solver import Solver
 from runtime.frame.targets import drawn
 from runtime.model.backends import Choice, Wanted, choose
-from runtime.model.base import trial_eyes_m
+from runtime.model.base import trial_eyes_m, warm_up
 from runtime.model.buffers import LayerSlots
 from runtime.model.predictor import Predictor
 from runtime.optics.stack import PanelStack
@@ -213,7 +213,7 @@ class RunningSolver:
         except ContextLost:
             raise
         except (Exception, SystemExit):  # including a `sys.exit()` in a vendor's code; the first step reports it
-            return predictor.warmed_ms
+            return warm_up(predictor)
         return costs
 
     def close(self) -> None:

@@ -103,11 +103,10 @@ def _products(
     column, row = (places[0] * (width, height)).astype(int).T
     target = view.pixels[row, column, :3] / np.float32(255)
     offset = (places % (1 / 64) * 64).reshape(-1, 2).T  # position within the pixel, whichever was chosen
-    rays = np.stack([*(np.tile((column, row), 2) + offset), np.ones(2 * len(row))])
+    u, v = (np.tile((column, row), 2) + offset)[:, None]
     middle_from_picture = stack.panel(stack.count // 2).raster_from_plane() @ view.plane_from_picture
-    crossed = panels_from_centre(eye_m, stack) @ (middle_from_picture @ rays)  # (N, 3, 2K)
-    positions = [(x / w, y / w) for x, y, w in crossed[:, :, None]]
-    seen = through_layers(layers, lambda _: positions, np.ones((1, 2 * len(row)), bool), stack, boxes=boxes)
+    matrices = panels_from_centre(eye_m, stack) @ middle_from_picture
+    seen = through_layers(layers, matrices, u, v, np.ones(u.shape, bool), boxes=boxes)
     first, second = np.split(seen.image[0] - np.tile(target, (2, 1)), 2)
     return np.asarray((first * second)[np.logical_and(*np.split(seen.mask[0], 2))])
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +11,7 @@ import numpy as np
 from runtime.clock import Stopwatch
 from runtime.model.job import Job, Savings, grey_job
 from runtime.optics.stack import PanelStack
-from runtime.records import F32, F64, SOLVING_STAGES, U8, Eyes
+from runtime.records import F32, F64, SOLVING_STAGES, U8
 
 if TYPE_CHECKING:
     from runtime.model.buffers import LayerSlots
@@ -59,7 +57,6 @@ class Predictor(ABC):
     reductions: tuple[int, ...] = (1,)  # supported rasters, given as divisors of the display's rows and columns
     steps: int = 0  # updates of all panels in a solution
     refined_steps: int = 0  # total number of updates that a continued solution can reach
-    warmed_ms: Mapping[int, Mapping[str, float]] = MappingProxyType({1: {}})  # stage times of `warm_up`, by reduction
 
     def reads_textures_of(self, context: object) -> bool:
         """Return True if `solve` accepts pictures held in this OpenGL context's textures (`DrawnPicture`)."""
@@ -83,15 +80,16 @@ class Predictor(ABC):
         inference failed or is not finite, and EyesNotServed for unsupported eye positions.
         """
 
-    def warm_up(self, eyes_m: Eyes) -> None:
-        """Solve grey pictures in one step on every raster, to allocate memory, and set `warmed_ms`."""
-        measured = {}
-        for reduction in self.reductions:
-            job = replace(grey_job(eyes_m, self.stack.reduced(reduction)), steps=1)
-            self.solve(job)
-            runs = [self.solve(job).stage_ms for _ in range(min(reduction, 3))]  # other processes may delay a run
-            measured[reduction] = {stage: min(run[stage] for run in runs) for stage in runs[0]}
-        self.warmed_ms = measured
-
     def close(self) -> None:  # noqa: B027 - most hold nothing
         """Release threads and sessions. May be called more than once."""
+
+
+def warm_up(predictor: Predictor) -> dict[int, dict[str, float]]:
+    """Solve grey pictures in one step on every raster, to allocate memory. Return stage times by raster."""
+    measured, eyes_m = {}, trial_eyes_m(predictor.stack)
+    for reduction in predictor.reductions:
+        job = replace(grey_job(eyes_m, predictor.stack.reduced(reduction)), steps=1)
+        predictor.solve(job)
+        runs = [predictor.solve(job).stage_ms for _ in range(min(reduction, 3))]  # other processes may delay a run
+        measured[reduction] = {stage: min(run[stage] for run in runs) for stage in runs[0]}
+    return measured

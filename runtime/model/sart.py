@@ -37,8 +37,8 @@ class SartPredictor(Predictor):
     provider = "numpy"
     parameters = 0
 
-    def __init__(self, stack: PanelStack, *, iterations: int = ITERATIONS, relaxation: float = RELAXATION) -> None:
-        self.stack, self.iterations, self._relaxation = stack, iterations, relaxation
+    def __init__(self, stack: PanelStack, *, iterations: int = ITERATIONS) -> None:
+        self.stack, self.iterations = stack, iterations
 
     def solve(self, job: Job, watch: Stopwatch | None = None) -> Prediction:
         watch, stack = watch or Stopwatch(*STAGES), self.stack
@@ -52,7 +52,7 @@ class SartPredictor(Predictor):
         panels: list[NDArray[np.float32]] = [np.full((*size, 3), rest, np.float32) for _ in range(stack.count)]
         forward = [[self._panel_from_middle(eye, n) for n in range(stack.count)] for eye in job.eyes_m]
         back = [[np.linalg.inv(matrix) for matrix in matrices] for matrices in forward]
-        share = np.float32(self._relaxation / (len(targets) * stack.count))
+        share = np.float32(RELAXATION / (len(targets) * stack.count))
         watch.lap("prepare")
         for _ in range(self.iterations):
             residuals = [

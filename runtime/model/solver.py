@@ -131,12 +131,10 @@ class StepPredictor(Predictor):
     def bound(
         self, *, backend: SolverBackend | None = None, stack: PanelStack | None = None, slots: LayerSlots | None = None
     ) -> StepPredictor:
-        other = StepPredictor(
+        return StepPredictor(
             stack or self.stack, self._proposal, self._steps, name=self.name, threads=self._threads,
             backend=backend or self._backend, slots=slots or self._slots,
         )  # fmt: skip
-        other.warmed_ms = self.warmed_ms
-        return other
 
     def solve(self, job: Job, watch: Stopwatch | None = None) -> Prediction:
         watch = watch or Stopwatch(*STAGES)

@@ -136,32 +136,32 @@ def _is_grey(view: TargetView, job: Job, window: SolveWindow | None) -> bool:
     return is_grey(view.picture)
 
 
-def differing_box(left: U8, right: U8, *, tolerance: int = TOLERANCE_CODES, known: PixelRect = NOWHERE) -> PixelRect:
-    """Return the smallest box, maybe empty, of all differences above `tolerance` codes between (h, w, 3
+def differing_box(left: U8, right: U8, *, known: PixelRect = NOWHERE) -> PixelRect:
+    """Return the smallest box, maybe empty, of all differences above `TOLERANCE_CODES` between (h, w, 3
     or 4) pictures. Pixels in `known`, a part of the result such as that of `coarse_box`, are not compared.
     """
     height, width = left.shape[:2]
 
     def look(part: PixelRect) -> PixelRect:
-        box = _box(left[part.slices], right[part.slices], tolerance)
+        box = _box(left[part.slices], right[part.slices])
         return PixelRect(box.u0 + part.u0, box.v0 + part.v0, box.u1 + part.u0, box.v1 + part.v0)
 
     parts = known.beside(width_px=width, height_px=height)
     return union([known, *parallel_map(look, [piece for part in parts for piece in part.in_rows(PIECE_ROWS)])])
 
 
-def coarse_box(left: U8, right: U8, *, tolerance: int = TOLERANCE_CODES) -> PixelRect:
+def coarse_box(left: U8, right: U8) -> PixelRect:
     """Return a box inside the result of `differing_box`, in a hundredth of the time. Only a few pixels
     are compared, enough to tell if the window would be too large to be useful.
     """
     few = [np.ascontiguousarray(picture[::COARSE_STEP, ::COARSE_STEP]) for picture in (left, right)]
-    u0, v0, u1, v1 = (COARSE_STEP * corner for corner in _box(few[0], few[1], tolerance).corners)
+    u0, v0, u1, v1 = (COARSE_STEP * corner for corner in _box(few[0], few[1]).corners)
     return PixelRect(u0, v0, u1 - COARSE_STEP + 1, v1 - COARSE_STEP + 1) if u1 > u0 else NOWHERE
 
 
-def _box(left: U8, right: U8, tolerance: int) -> PixelRect:
+def _box(left: U8, right: U8) -> PixelRect:
     difference = cv2.absdiff(left, right)
-    agree = cv2.inRange(difference, (0, 0, 0, 0), (tolerance, tolerance, tolerance, 255))
+    agree = cv2.inRange(difference, (0, 0, 0, 0), (*[TOLERANCE_CODES] * 3, 255))
     u, v, width, height = cv2.boundingRect(cv2.bitwise_not(agree))
     return PixelRect(u, v, u + width, v + height)
 

@@ -10,7 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from runtime.optics.retina import Rays
+from runtime.optics.retina import ImageRays
+from runtime.optics.rpu import panel_from_image
+from runtime.optics.sampling import projected
 from runtime.optics.stack import PanelStack, between_pixel_centres
 from runtime.optics.views import stack_from_eye
 from runtime.records import F32, F64, U8, Eyes
@@ -130,8 +132,9 @@ def doubts(eyes_m: ArrayLike, stack: PanelStack, *, fov_deg: float, size: tuple[
     width_px, height_px = 64, max(2, round(64 * size[1] / size[0]))
     shares = []
     for eye in eyes:
-        rays = Rays.of_eye(eye, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
-        u, v = rays.on(stack.panel(stack.count // 2))
+        rays = ImageRays.of_eye(eye, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
+        middle_from_image = panel_from_image(rays.image_from_stack, stack.panel(stack.count // 2))
+        u, v, _ = projected(middle_from_image, rays.u, rays.v)
         inside = rays.toward_panels() & (u > 0) & (u < stack.width_px) & (v > 0) & (v < stack.height_px)
         shares.append(float(inside.mean()))
     if 1 - min(shares) > OUTSIDE_MOST:

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from runtime.optics.pupil import PUPIL_MM
-from runtime.optics.quality import psnr_db
-from runtime.optics.retina import Rays, Retina, average, pupil_points, through_layers
+from runtime.optics.quality import psnr_db, squared_error
+from runtime.optics.retina import Retina, average, layers_from_image, pupil_points, through_layers
 from runtime.optics.stack import PanelStack, Plane, PlaneRaster
 from runtime.optics.views import raster_from_stack, stack_from_eye
 from runtime.records import F32, F64, U8, Eyes
@@ -58,20 +58,15 @@ class RetinaPixels:
 
     def seen(self, layers: U8, stack: PanelStack, eye_m: F64, *, plane_m: float) -> Retina:
         """Compute the retina picture of an eye that looks through layers and focuses on x = `plane_m`."""
-        u, v = (
-            np.arange(0, count, self.every, dtype=np.float64) + 0.5
-            for count in (self.raster.width_px, self.raster.height_px)
-        )
-        panels = [stack.panel(index) for index in range(stack.count)]
+        u, v = (np.arange(0, count, self.every) + 0.5 for count in (self.raster.width_px, self.raster.height_px))
         mask = np.ones((len(v), len(u)), bool)
 
-        def through(matrix: F64) -> F32:
-            rays = Rays(matrix, u, v[:, None])
-            retina = through_layers(layers, lambda rows: (rays.on(panel, rows) for panel in panels), mask, stack)
+        def through(point: F64, projection: F64) -> F32:
+            retina = through_layers(layers, layers_from_image(projection, stack, point), u, v[:, None], mask)
             mask[:] = retina.mask
             return retina.image
 
-        image = average(through(matrix) for _, matrix in self.projections(eye_m, plane_m=plane_m))
+        image = average(through(*ray) for ray in self.projections(eye_m, plane_m=plane_m))
         return Retina(image, mask)
 
     def true(self, picture_of: Callable[[F64, F64], F32], eye_m: F64, *, plane_m: float) -> F32:
@@ -106,8 +101,8 @@ def retina_db(pictures: Iterable[tuple[Retina, F32]]) -> float:
     """
     total, counted = 0.0, 0
     for seen, true in pictures:
-        error = (seen.image - true)[seen.mask].astype(np.float64)
-        total, counted = total + float((error * error).sum()), counted + error.size
+        error, terms = squared_error(seen.image, true, seen.mask)
+        total, counted = total + error, counted + terms
     return psnr_db(total / counted) if counted else math.nan
 
 

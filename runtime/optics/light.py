@@ -11,17 +11,19 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from runtime import kernels
 from runtime.optics.malus import intensity_from_phase
 from runtime.optics.pupil import PUPIL_MM
-from runtime.optics.retina import Rays, checked_eye, pupil_points
+from runtime.optics.retina import ImageRays, checked_eye, pupil_points
 from runtime.optics.rpu import panel_from_image
 from runtime.optics.stack import PanelStack
-from runtime.optics.tilt import layer_from_seen, layer_pixels_from_seen
+from runtime.optics.tilt import seen_on_layers
 from runtime.optics.views import stack_from_eye
 from runtime.records import F32, F64, U8, Eyes
 
@@ -39,16 +41,6 @@ class Sampling(NamedTuple):
 
 LIGHT = Sampling()
 ONE_RAY = Sampling(rays=0, pupil_mm=0.0)
-
-
-class LightView(NamedTuple):
-    """An eye's target picture, and the geometry of the rays through its pixels."""
-
-    target: F32  # (h, w, 3) intensities
-    centre_from_image: F64  # (3, 3) homography from picture pixels to centre-panel pixels
-    panels_from_centre: F64  # (pupil points, N, 3, 3) homographies from centre-panel pixels to each panel's
-    toward: F64  # (3,) vector whose dot product with (u, v, 1) is negative for rays towards the panels
-    first_ray: int  # number of the view's first ray, used to seed its random positions
 
 
 def squared_errors(
@@ -78,16 +70,14 @@ def squared_errors(
     table = intensity_from_phase(np.arange(255 * fine * stack.count + 1, dtype=np.float32) / np.float32(255 * fine))
     calls = []
     for side, (nominal, true, target) in enumerate(zip(solved_for_m, eyes_m, targets, strict=True)):
-        view = view_of(side, nominal, true, target, stack, fov_deg=fov_deg, pupil_mm=sampling.pupil_mm)
+        view = _view(nominal, true, target, stack, fov_deg=fov_deg, pupil_mm=sampling.pupil_mm)
+        rays = side << 40, sampling.rays  # eyes share no numbers of rays, which seed their random positions
         rows = range(0, len(target), step * -(-len(target) // (parts * step)))
-        calls += [(view, first, last) for first, last in zip(rows, [*rows[1:], len(target)], strict=True)]
-
-    def error(call: tuple[LightView, int, int]) -> tuple[float, int]:
-        view, first, last = call
-        return _squared_error(codes, view, table, sampling, first, last)
+        calls += [(codes, *view, table, rays, step, part) for part in pairwise([*rows, len(target)])]
 
     with ThreadPoolExecutor(cores) as pool:
-        sums = np.array(list(pool.map(error, calls)), np.float64)  # (calls, 2): sum of squared errors, number of terms
+        # (calls, 2): sum of squared errors, number of terms
+        sums = np.array(list(pool.map(lambda call: kernels.library().squared_error(*call), calls)), np.float64)
     if not sums[:, 1].any():
         raise ValueError("no ray from these eyes crosses every panel")
     if sampling.groups:  # each call measured one row
@@ -97,43 +87,24 @@ def squared_errors(
     return np.asarray(total / np.maximum(counted, 1))
 
 
-def _squared_error(
-    codes: U8, view: LightView, table: F32, sampling: Sampling, first: int, last: int
-) -> tuple[float, int]:
-    """Return the sum of squared errors over the rows from `first` to `last` - 1, and the number of terms."""
-    total, counted = kernels.library().squared_error(
-        codes, np.ascontiguousarray(view.target, np.float32),
-        *(np.ascontiguousarray(x, np.float64) for x in (view.centre_from_image, view.panels_from_centre, view.toward)),
-        np.ascontiguousarray(table, np.float32), (view.first_ray, sampling.rays), sampling.step, (first, last),
-    )  # fmt: skip
-    return total, counted
-
-
-def view_of(
-    side: int, nominal_m: F64, true_m: F64, target: F32, stack: PanelStack, *, fov_deg: float, pupil_mm: float
-) -> LightView:
-    """Return one eye's target and rays. The eye is a pinhole if `pupil_mm`, its diameter, is 0. Raises
-    ValueError if the nominal eye or a point on the true eye's pupil is not in front of every panel.
+def _view(
+    nominal_m: F64, true_m: F64, target: F32, stack: PanelStack, *, fov_deg: float, pupil_mm: float
+) -> tuple[NDArray[np.floating[Any]], ...]:
+    """Return an eye's target and rays as `kernels.squared_error` takes them: the homographies from the picture to the
+    centre panel, and from there to each layer for each point of the pupil, and `ImageRays.toward`. Raises ValueError if
+    the nominal eye or a point on the true eye's pupil is not in front of every panel.
     """
     height, width = target.shape[:2]
-    rays = Rays.of_eye(checked_eye(nominal_m, stack), width_px=width, height_px=height, fov_deg=fov_deg)
-    centre = panel_from_image(rays.from_stack, stack.panel(stack.count // 2))
+    rays = ImageRays.of_eye(checked_eye(nominal_m, stack), width_px=width, height_px=height, fov_deg=fov_deg)
+    centre = panel_from_image(rays.image_from_stack, stack.panel(stack.count // 2))
     pupil = pupil_points(pupil_mm / 1e3, rings=RINGS if pupil_mm > 0 else 0)
     ends = [checked_eye(true_m + place, stack) for place in pupil @ stack_from_eye(nominal_m)[:3, :2].T]
-    return LightView(target, centre, panels_from_centre(np.array(ends), stack), rays.toward(), first_ray(side))
-
-
-def first_ray(side: int) -> int:
-    """Return the number of an eye's first ray. Eyes share no ray numbers."""
-    return side << 40
+    homographies = (np.ascontiguousarray(x) for x in (centre, panels_from_centre(np.array(ends), stack), rays.toward))
+    return np.ascontiguousarray(target, np.float32), *homographies
 
 
 def panels_from_centre(true_m: F64, stack: PanelStack) -> F64:
     """Return homographies (..., N, 3, 3) from centre-panel to layer pixels along each eye's rays."""
     centre = stack.panel(stack.count // 2)
     matrices = np.stack([centre.to(stack.panel(n), true_m) for n in range(stack.count)], axis=-3)
-    if stack.tilt is not None:
-        for place in np.ndindex(*matrices.shape[:-2]):
-            moved = layer_from_seen(stack, place[-1], true_m[place[:-1]])
-            matrices[place] = layer_pixels_from_seen(stack.panel(place[-1]), moved) @ matrices[place]
-    return matrices
+    return seen_on_layers(matrices, stack, true_m)

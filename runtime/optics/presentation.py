@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.optics.malus import rest_code
-from runtime.optics.sampling import Pixels, bilinear
+from runtime.optics.sampling import Pixels, bilinear, projected
 from runtime.records import F32, F64, U8, PanelFrame, Parallax
 
 ROWS = 32  # rows resampled at a time; a strip's float32 pixels fit in a core's cache
@@ -235,10 +235,7 @@ def shown_picture(draw: PanelDraw, solved: U8 | None, flat: U8 | None) -> U8:
 
 def on_layer(mount: Mount, u: Pixels, v: Pixels, size_px: tuple[int, int]) -> tuple[Pixels, Pixels, NDArray[np.bool_]]:
     """Return the layer's positions for monitor pixels, and a mask of those inside the layer."""
-    m = mount.layer_from_screen
-    with np.errstate(divide="ignore", invalid="ignore"):
-        w = m[2, 0] * u + m[2, 1] * v + m[2, 2]
-        x, y = (m[0, 0] * u + m[0, 1] * v + m[0, 2]) / w, (m[1, 0] * u + m[1, 1] * v + m[1, 2]) / w
+    x, y, w = projected(mount.layer_from_screen, u, v)
     inside = (w > 0) & (x >= 0) & (y >= 0) & (x < size_px[0]) & (y < size_px[1])
     return np.where(inside, x, 0.0), np.where(inside, y, 0.0), inside
 

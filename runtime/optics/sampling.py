@@ -8,9 +8,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.records import F32, U8
+from runtime.records import F32, F64, U8
 
 Pixels = NDArray[np.floating[Any]]
+
+
+def projected(matrix: F64, u: Pixels, v: Pixels) -> tuple[Pixels, Pixels, Pixels]:
+    """Return x, y and the weight to which a 3x3 homography maps u and v, which are broadcast.
+    At a weight of 0, x and y are not finite.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        w = matrix[2, 0] * u + matrix[2, 1] * v + matrix[2, 2]
+        x = (matrix[0, 0] * u + matrix[0, 1] * v + matrix[0, 2]) / w
+        return x, (matrix[1, 0] * u + matrix[1, 1] * v + matrix[1, 2]) / w, w
 
 
 def bilinear(picture: U8 | F32, x: Pixels, y: Pixels) -> F32:

@@ -34,6 +34,17 @@ def layer_pixels_from_seen(raster: PlaneRaster, layer_from_seen_m: F64) -> F64:
     return raster.raster_from_plane() @ layer_from_seen_m @ raster.plane_from_raster()
 
 
+def seen_on_layers(panels_from: F64, stack: PanelStack, eyes_m: F64) -> F64:
+    """Continue homographies (..., N, 3, 3) to ideal panels' pixels to what eyes (..., 3) see of layers."""
+    if stack.tilt is None:
+        return panels_from
+    moved = np.empty_like(panels_from)
+    for place in np.ndindex(*panels_from.shape[:-2]):
+        layer_from_panel = layer_from_seen(stack, place[-1], eyes_m[place[:-1]])
+        moved[place] = layer_pixels_from_seen(stack.panel(place[-1]), layer_from_panel) @ panels_from[place]
+    return moved
+
+
 def coarse_layer_from_seen(stack: PanelStack, index: int, eye_m: F64) -> F64:
     """Return the simplest map that approximates `layer_from_seen` to `UNSEEN_PX` at nine points of the
     panel. Candidates: the identity, a scale and shift (fast to resample), an affine map, and the exact homography.

@@ -21,7 +21,7 @@ from runtime.evaluation.trials import timed_in_turn
 from runtime.model.backends import choose
 from runtime.model.job import Job
 from runtime.model.predictor import Predictor, load_predictor
-from runtime.optics.retina import seen_by
+from runtime.optics.retina import sees_panels
 from runtime.optics.stack import PanelStack
 from runtime.plan.drawing import drawn_job, retina_pictures
 from runtime.plan.savings import Measured, Saving, make_plan
@@ -151,8 +151,5 @@ def _check_viewer(eyes_m: Eyes, stack: PanelStack, *, fov_deg: float) -> None:
             "",
             f"x = {nearest_m:g} m is not in front of the panels; x must exceed {max(stack.x_m):g} m",
         )
-    # A coarse raster is enough to find out if the display is visible.
-    coarse = replace(stack, width_px=64, height_px=36)
-    blank = np.zeros((stack.count, coarse.height_px, coarse.width_px, 3), np.uint8)
-    if not any(seen_by(eye_m, blank, coarse, fov_deg=fov_deg).mask.any() for eye_m in eyes_m):
+    if not any(sees_panels(eye_m, stack, fov_deg=fov_deg) for eye_m in eyes_m):
         raise InputError("sensor.fixed_eyes_m", "", "these eyes cannot see any part of the display")

@@ -20,8 +20,10 @@ from runtime.model.session import ModelSession
 from runtime.model.still import solve_still
 from runtime.optics.carried import expected_psnrs_db
 from runtime.optics.light import ONE_RAY
-from runtime.optics.retina import Rays
+from runtime.optics.retina import layers_from_image
+from runtime.optics.sampling import projected
 from runtime.optics.stack import PanelStack
+from runtime.optics.views import image_from_stack
 from runtime.report.pairs import eyes_at
 from tests.model.scenes import FOV_DEG, STACK, card_scene, displayed, eyes
 
@@ -194,8 +196,9 @@ def test_every_pixel_on_a_ray_through_all_panels_is_solved(pose: str) -> None:
     pair = POSES[pose]
     boxes = visible_boxes(pair, STACK)
     for eye in pair:
-        rays = Rays.of_eye(eye, width_px=480, height_px=270, fov_deg=70)
-        positions = [rays.on(STACK.panel(n)) for n in range(STACK.count)]
+        image = image_from_stack(eye, width_px=480, height_px=270, fov_deg=70)
+        v, u = np.mgrid[:270, :480] + 0.5
+        positions = [projected(matrix, u, v)[:2] for matrix in layers_from_image(image, STACK, eye)]
         through = np.ones((270, 480), bool)
         for u, v in positions:
             through &= (u > 0.5) & (u < 479.5) & (v > 0.5) & (v < 269.5)

@@ -36,16 +36,16 @@ def test_the_box_is_exactly_where_they_differ(v: int, u: int, height: int, width
     left = np.full((100, 160, 4), 100, np.uint8)
     right = left.copy()
     right[v : v + height, u : u + width, 1] = (100 + step) % 256
-    box = differing_box(left, right, tolerance=2)
+    box = differing_box(left, right)
     assert box == PixelRect(u, v, min(u + width, 160), min(v + height, 100))
 
 
 def test_eyes_that_agree_within_the_tolerance_leave_nothing_to_do() -> None:
     left = np.full((100, 160, 4), 100, np.uint8)
     right = left + np.uint8(2)
-    assert differing_box(left, right, tolerance=2).width_px == 0
+    assert differing_box(left, right).width_px == 0
     right[..., 3] = 0  # coverage is not light
-    assert differing_box(left, right, tolerance=2).width_px == 0
+    assert differing_box(left, right).width_px == 0
 
 
 def test_a_picture_that_differs_everywhere_is_whole() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -17,10 +16,9 @@ from runtime.optics.carried import carried_db, expected_psnrs_db
 from runtime.optics.light import LIGHT, ONE_RAY, Sampling
 from runtime.optics.quality import quality
 from runtime.optics.retina import seen_by
-from runtime.optics.stack import PanelStack, Tilt
+from runtime.optics.stack import PanelStack
 from runtime.records import U8
 from tests.optics import reference
-from tests.optics.carried_rays import seen_along
 from tests.optics.strategies import floats
 
 SIZE = (17, 11)  # of the pictures, pixels
@@ -74,21 +72,6 @@ def test_expected_psnr_is_five_points_of_the_eyes_common_place(stack: PanelStack
     how = {"eyes_m": eyes, "fov_deg": 30, "sigmas_mm": (sigma_mm,), "sampling": ONE_RAY}
     told = expected_psnrs_db(layers, pictures, stack, **how)[sigma_mm]
     assert told == pytest.approx(-10 * math.log10(total), abs=2e-3)
-
-
-def test_light_of_tilted_panels_takes_the_rays_that_a_retina_takes() -> None:
-    tilt = Tilt(((0.001, 0.02, -0.03), (0.0, 0.0, 0.0), (-0.002, 0.01, 0.02)), (0.7, 0.05, 0.1))
-    stack = replace(STACKS[0], tilt=tilt)
-    layers, pictures, eyes = case(stack, 7)
-    true = eyes + np.array([0.01, 0.02, -0.01])
-    view = {"width_px": SIZE[0], "height_px": SIZE[1], "fov_deg": 30}
-    seen = [seen_along(*places, layers, stack, **view) for places in zip(eyes, true, strict=True)]
-    wanted = [picture.astype(np.float32) / np.float32(255) for picture in pictures]
-    expected = quality([r.image for r in seen], wanted, [r.mask for r in seen])
-    where = {"solved_for_m": eyes, "eyes_m": true, "fov_deg": 30}
-    assert carried_db(layers, pictures, stack, **where) == pytest.approx(expected.psnr_db, abs=1e-3)
-    untilted = carried_db(layers, pictures, STACKS[0], **where)
-    assert abs(untilted - expected.psnr_db) > 0.01, "this test must be able to fail"
 
 
 def test_at_the_eyes_solved_for_carried_quality_is_the_exact_one() -> None:

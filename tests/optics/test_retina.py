@@ -10,7 +10,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from runtime.optics.retina import Rays, average, pupil_points, seen_by
+from runtime.optics.retina import ImageRays, average, pupil_points, seen_by
 from runtime.optics.stack import PanelStack
 from tests.optics import reference
 from tests.optics.strategies import eyes, floats, stacks
@@ -79,7 +79,7 @@ def test_an_eye_that_is_not_before_every_panel_is_refused(eye: list[float]) -> N
 def test_rays_that_leave_the_panels_behind_do_not_count() -> None:
     # Nearly along the panels, half of a wide image looks away from them.
     eye = [0.05, 0.6, 0.0]
-    mask = Rays.of_eye(eye, width_px=64, height_px=40, fov_deg=120).toward_panels()
+    mask = ImageRays.of_eye(eye, width_px=64, height_px=40, fov_deg=120).toward_panels()
     for u in range(0, 64, 7):
         for v in range(0, 40, 7):
             ray = reference.ray(tuple(eye), u + 0.5, v + 0.5, width=64, height=40, fov_deg=120)

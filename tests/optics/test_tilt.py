@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from runtime.optics.focus import RetinaPixels
 from runtime.optics.malus import phase_from_intensity
-from runtime.optics.retina import seen_by
+from runtime.optics.retina import Retina, seen_by
 from runtime.optics.stack import PanelStack, Tilt
 from runtime.optics.tilt import UNSEEN_PX, coarse_layer_from_seen, layer_from_seen
 
@@ -85,15 +87,19 @@ def test_a_stack_that_is_turned_tilts_the_other_way_about() -> None:
     np.testing.assert_allclose(found[:2] / found[2], [-whole[1] / whole[2], -whole[0] / whole[2]], atol=1e-12)
 
 
-def test_the_simulated_retina_looks_through_tilted_panels() -> None:
+LOOKS: dict[str, Callable[[NDArray[np.float32], PanelStack, NDArray[np.float64]], Retina]] = {
+    "pinhole": lambda layers, stack, eye: seen_by(eye, layers, stack, fov_deg=40.0, width_px=192, height_px=108),
+    "pupil": lambda layers, stack, eye: RetinaPixels(stack.panel(1)).seen(layers, stack, eye, plane_m=0.01),
+}
+
+
+@pytest.mark.parametrize("look", LOOKS)
+def test_a_simulated_retina_looks_through_tilted_panels(look: str) -> None:
     small = replace(TILTED, width_px=192, height_px=108)
-    flat = replace(small, tilt=None)
-    view = {"fov_deg": 40.0, "width_px": 192, "height_px": 108}
     eye = np.array([0.5, -0.1, 0.02])
     ramps = np.zeros((3, 108, 192, 3), np.float32)
     ramps[2, ..., 0], ramps[2, ..., 1] = (np.arange(192) + 0.5) / 192, ((np.arange(108) + 0.5) / 108)[:, None]
-    row, column = 30, 50
-    seen, ideal = (seen_by(eye, ramps, stack, **view).image[row, column, :2] for stack in (small, flat))
+    seen, ideal = (LOOKS[look](ramps, stack, eye).image[30, 50, :2] for stack in (small, replace(small, tilt=None)))
     (u, v), (ideal_u, ideal_v) = (phase_from_intensity(each, 1) * [192, 108] for each in (seen, ideal))
     pitch = small.width_m / small.width_px
     y, z = traced(small, 2, eye, (ideal_u * pitch - small.width_m / 2, small.height_m / 2 - ideal_v * pitch))
