@@ -206,7 +206,7 @@ class Film:
 
     def rgb(self, frames: tuple[av.VideoFrame, ...], *, background: Colour = (0.0, 0.0, 0.0)) -> U8:
         """Convert frames to an upright (h, w, 3) picture over a background, with two views side by side."""
-        views = [_rgb(frame, background) for frame in frames]
+        views = [rgb_of(frame, background) for frame in frames]
         return views[0] if len(views) == 1 else np.concatenate(views, axis=1)
 
     def close(self) -> None:
@@ -294,7 +294,8 @@ def _progressive(frame: av.VideoFrame) -> Any:
     return graph
 
 
-def _rgb(frame: av.VideoFrame, background: Colour) -> U8:
+def rgb_of(frame: av.VideoFrame, background: Colour = (0.0, 0.0, 0.0)) -> U8:
+    """Convert a frame to an upright picture (h, w, 3) in sRGB, over a background."""
     if frame.colorspace == UNSPECIFIED and (frame.width >= 1280 or frame.height > 576):  # as players do
         frame.colorspace = BT709
     if any(component.is_alpha for component in frame.format.components):
