@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calib.pairs import Pairs
-from calib.robust import fit_robust
-from calib.similarity import Degenerate, Similarity, extents, fit
+from calib.similarity import Degenerate, Similarity, extents, fit, fit_robust
 from calib.solution import CalibrationSolution
 from runtime.errors import InputError
 from runtime.eyes.calibration import check_similarity

@@ -5,6 +5,9 @@ maximises the correlation of the centred points (Kabsch, Umeyama 1991). The scal
 (docs/calibration.md): `least-squares` minimises the error in the stack frame (EyeReal, (20)), so that sensor noise
 makes it too small; `inverse` minimises it in the sensor frame, which is consistent if only the sensor's points are
 noisy; `seed`, the ratio of the RMS radii (22), is the geometric mean of both.
+
+If some pairs may have gross errors, FAST-LTS (Rousseeuw & Van Driessen 1999) finds the half of the pairs that agree
+best. The noise is estimated from this half, and pairs with much larger errors are rejected.
 """
 
 from __future__ import annotations
@@ -13,8 +16,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from runtime.records import F64
 
@@ -22,6 +26,13 @@ ScaleRule = Literal["seed", "least-squares", "inverse"] | float
 EPSILON = float(np.finfo(np.float64).eps)
 ROTATION_BOUND_RAD = 1e-6  # rotation caused by rounding errors above which points are refused
 POLISH_ABOVE = 1e2  # ratio of the points' two largest extents above which the cross-covariance loses digits
+STARTS = 120  # number of random subsets to start from
+START_PAIRS = 4  # number of pairs in each subset
+STEPS = 4  # number of concentration steps from each subset
+MAX_SCORED = 2000  # number of pairs above which the search uses a random sample; all pairs are then tested
+REJECTION_PROBABILITY = 1e-4  # probability that a good pair with Gaussian noise is rejected
+RULE: ScaleRule = "inverse"
+MIN_NOISE = 1e-12  # minimum noise relative to the points' extent, so that exact data are not rejected
 
 
 class Degenerate(ValueError):
@@ -179,3 +190,78 @@ def _polished(start: Similarity, sensor_m: F64, stack_m: F64, *, rule: ScaleRule
     scale = _scale(rule, sensor_power=(sensor**2).sum(), stack_power=(stack**2).sum(), correlation=correlation)
     rotation = axes.T @ rotation
     return Similarity(np.asarray(scale), rotation, stack_mean - scale * (rotation @ sensor_mean))
+
+
+@dataclass(frozen=True, slots=True)
+class RobustFit:
+    """A similarity fitted to the pairs that agree with each other."""
+
+    similarity: Similarity
+    inlier: NDArray[np.bool_]  # (K,) True for pairs that agree, False for rejected pairs
+
+
+def _residuals(candidate: Similarity, sensor_m: F64, stack_m: F64) -> F64:
+    """Return squared errors (..., K) in m² over the squared scale, which would otherwise favour small scales."""
+    squared = ((candidate.points(sensor_m) - stack_m) ** 2).sum(-1)
+    residuals: F64 = squared / np.maximum(candidate.scale[..., None], 1e-300) ** 2
+    return residuals
+
+
+def _best_half(sensor_m: F64, stack_m: F64, *, random: np.random.Generator) -> NDArray[np.intp]:
+    """Return the indices of the half of the pairs that agree best. The search starts from many random subsets. Each fit
+    is then repeated on the half of the pairs that it fits best.
+    """
+    count = len(sensor_m)
+    keep = min(count, max(3, (count + 5) // 2))
+    chosen = np.argsort(random.random((STARTS, count)), axis=1)[:, : min(START_PAIRS, count)]
+    for _ in range(1 + STEPS):
+        candidates = fit_batch(sensor_m[chosen], stack_m[chosen], rule=RULE)
+        squared = np.nan_to_num(_residuals(candidates, sensor_m, stack_m), nan=np.inf)
+        chosen = np.argpartition(squared, keep - 1, axis=-1)[:, :keep]
+    sums = np.take_along_axis(squared, chosen, axis=-1).sum(-1)
+    winner = int(np.argmin(sums))
+    if not np.isfinite(sums[winner]):
+        raise Degenerate("no similarity transform fits at least half of the pairs; check the pairs or capture new ones")
+    return np.asarray(chosen[winner])
+
+
+def fit_robust(sensor_m: F64, stack_m: F64) -> RobustFit:
+    """Fit a similarity, deterministically, to those of K >= 3 points (K, 3) in `sensor` and `stack` that
+    agree. Five pairs or fewer have no clear majority, so all of them are used. Raises Degenerate as
+    `similarity.fit`.
+    """
+    count = len(sensor_m)
+    everything = fit(sensor_m, stack_m, rule=RULE)
+    spread = float(np.sqrt(((stack_m - stack_m.mean(0)) ** 2).sum(-1).mean()))
+    if count <= 5:
+        return RobustFit(everything, np.ones(count, bool))
+    random = np.random.default_rng(0)
+    scored = random.permutation(count)[:MAX_SCORED] if count > MAX_SCORED else np.arange(count)
+    # The points are centred for precision, because the batched fits are not refined.
+    half = scored[_best_half(sensor_m[scored] - sensor_m.mean(0), stack_m[scored] - stack_m.mean(0), random=random)]
+    limit = float(chi2.ppf(1 - REJECTION_PROBABILITY, 3))
+    inlier = np.zeros(count, bool)
+    inlier[half] = True
+    current = fit(sensor_m[inlier], stack_m[inlier], rule=RULE)
+    squared = ((current.points(sensor_m) - stack_m) ** 2).sum(-1)
+    # Estimate the noise from a quantile of chi² with three degrees of freedom, and correct the bias of small samples.
+    share = len(half) / len(scored)
+    noise_m = np.sqrt(np.partition(squared[scored], len(half) - 1)[len(half) - 1] / chi2.ppf(0.999 * share, 3))
+    noise_m *= 1 + 5 / max(len(scored) - 3, 1)
+    for _ in range(20):
+        kept = squared <= limit * max(noise_m, MIN_NOISE * spread) ** 2
+        if kept.sum() < 3:
+            break
+        current = fit(sensor_m[kept], stack_m[kept], rule=RULE)
+        squared = ((current.points(sensor_m) - stack_m) ** 2).sum(-1)
+        noise_m = max(_noise(current, sensor_m, stack_m, kept), noise_m * 0.5)
+        if np.array_equal(kept, inlier):
+            break
+        inlier = kept
+    return RobustFit(everything if inlier.all() else current, inlier)
+
+
+def _noise(similarity: Similarity, sensor_m: F64, stack_m: F64, inlier: NDArray[np.bool_]) -> float:
+    """Return the inliers' deviation per coordinate in `stack`, with seven degrees of freedom less for the fit."""
+    squared = ((similarity.points(sensor_m) - stack_m) ** 2).sum(-1)[inlier].sum()
+    return float(np.sqrt(squared / max(3 * int(inlier.sum()) - 7, 1)))

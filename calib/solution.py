@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from calib.robust import fit_robust
-from calib.similarity import Similarity, fit
+from calib.similarity import Similarity, fit, fit_robust
 from runtime.eyes.calibration import position_jacobian
 from runtime.records import F64
 

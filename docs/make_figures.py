@@ -24,8 +24,7 @@ from runtime.optics.real.panels import Placement, RealPanels
 from runtime.optics.retina import as_codes, seen_by
 from runtime.report.pairs import PairPainter, eyes_at
 from runtime.report.tolerance import IMPERFECTIONS, solved, together
-from runtime.report.tolerance_page import scene_pair
-from runtime.report.tolerance_picture import seen_through
+from runtime.report.tolerance_page import scene_pair, seen_through
 from runtime.support.artifacts import write_png
 
 IMAGES = Path(__file__).resolve().parent / "images"

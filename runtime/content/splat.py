@@ -10,7 +10,7 @@ import numpy as np
 
 from runtime.content.base import ContentInfo, View
 from runtime.content.canvas import OVER, SIDES, CanvasSource
-from runtime.content.compressed_splats import load_compressed_splats
+from runtime.content.compressed_splats import load_compressed, load_compressed_splats, load_splat
 from runtime.content.gaussians import (
     AT_ONCE,
     Gaussians,
@@ -22,7 +22,6 @@ from runtime.content.gaussians import (
     nearest_blocks,
     seen_splats,
 )
-from runtime.content.packed_splats import load_compressed, load_splat
 from runtime.content.placing import SceneFile
 from runtime.content.ply import read_header
 from runtime.optics.rect import PixelRect

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import re
 import shutil
@@ -9,6 +10,7 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from ctypes import POINTER, Structure, c_char_p, c_int, c_int16, c_uint, c_uint8, c_uint16, c_uint32, c_void_p
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any
@@ -21,7 +23,6 @@ from runtime.config import Section, validated
 from runtime.content.base import ContentSource
 from runtime.content.live import Feed, LiveSource, end_group
 from runtime.content.placing import SceneFile
-from runtime.content.x_pointer import BUTTON, Pointed, XPointer
 from runtime.errors import InputError, one_line
 from runtime.records import U8
 
@@ -30,6 +31,7 @@ AGAIN_S = 0.5  # pause before the next attempt
 CLICK_S = 0.02  # how often the mouse button is looked at while the user chooses a window
 LOOKED_UP_WITHIN_S = 3.0  # time limit for the list of windows, and for a virtual screen's start
 OURS = "phasestack"  # class and title of our own panels
+BUTTON = 1 << 8  # bit of the first mouse button
 WINDOW = re.compile(  # a line of `xwininfo -root -tree`
     r'^\s*(?P<id>0x[0-9a-f]+) (?P<name>".*"|\(has no name\)): \((?P<kind>.*)\)\s+(?P<w>\d+)x(?P<h>\d+)\S+'
     r"\s+(?P<x>[+-]-?\d+)(?P<y>[+-]-?\d+)\s*$"
@@ -228,3 +230,68 @@ def pointer_in(now: Pointed | None, place: Place | None, size_px: tuple[int, ...
     left, top = (0, 0) if place is None else (place.x, place.y)
     u, v = (now.x - left + 0.5) / size_px[1], (now.y - top + 0.5) / size_px[0]
     return (u, v) if 0 <= u < 1 and 0 <= v < 1 else None
+
+
+# The mouse pointer is read through libxcb, because libX11 ends the process if the X server ends.
+
+
+class _Screens(Structure):
+    _fields_ = (("data", POINTER(c_uint32)), ("rem", c_int), ("index", c_int))  # a screen begins with its root window
+
+
+class _Cookie(Structure):
+    _fields_ = (("sequence", c_uint),)
+
+
+class Pointed(Structure):
+    """Place of the pointer, in pixels from the screen's top left corner."""
+
+    _fields_ = (
+        ("response", c_uint8), ("same_screen", c_uint8), ("sequence", c_uint16), ("length", c_uint32),
+        ("root", c_uint32),
+        ("child", c_uint32),  # number of the top-level window under the pointer, or 0
+        ("x", c_int16), ("y", c_int16), ("window_x", c_int16), ("window_y", c_int16),
+        ("buttons", c_uint16),  # pressed buttons and keys, such as `BUTTON`
+    )  # fmt: skip
+
+
+class XPointer:
+    """Connection to an X server that reads its pointer."""
+
+    def __init__(self, display: str) -> None:
+        """Connect. Raises OSError if libxcb is missing or the server cannot be reached."""
+        self._xcb, self._free = ctypes.CDLL("libxcb.so.1"), ctypes.CDLL(None).free
+        self._free.argtypes = [c_void_p]
+        for name, result, *given in (
+            ("xcb_connect", c_void_p, c_char_p, c_void_p),
+            ("xcb_connection_has_error", c_int, c_void_p),
+            ("xcb_disconnect", None, c_void_p),
+            ("xcb_get_setup", c_void_p, c_void_p),
+            ("xcb_setup_roots_iterator", _Screens, c_void_p),
+            ("xcb_query_pointer", _Cookie, c_void_p, c_uint32),
+            ("xcb_query_pointer_reply", POINTER(Pointed), c_void_p, _Cookie, c_void_p),
+        ):
+            function: Any = getattr(self._xcb, name)
+            function.restype, function.argtypes = result, given
+        self._connection: Any = self._xcb.xcb_connect(display.encode(), None)
+        if self._xcb.xcb_connection_has_error(self._connection):
+            self.close()
+            raise OSError(f"the X server {display} cannot be used")
+        setup = self._xcb.xcb_get_setup(self._connection)
+        self._root: int = self._xcb.xcb_setup_roots_iterator(setup).data[0]
+
+    def now(self) -> Pointed | None:
+        """Return the pointer's place, or None if it is on another screen or the connection is lost."""
+        cookie = self._xcb.xcb_query_pointer(self._connection, self._root)
+        reply = self._xcb.xcb_query_pointer_reply(self._connection, cookie, None)
+        if not reply:
+            return None
+        found = Pointed.from_buffer_copy(reply.contents)
+        self._free(reply)
+        return found if found.same_screen else None
+
+    def close(self) -> None:
+        """Close the connection. Has no effect if it is closed."""
+        if self._connection is not None:
+            self._xcb.xcb_disconnect(self._connection)
+            self._connection = None

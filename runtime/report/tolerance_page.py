@@ -11,13 +11,19 @@ from pathlib import Path
 from textwrap import fill
 from typing import Any
 
+import numpy as np
+
 from runtime.config import ModelSettings, load_settings
 from runtime.errors import InputError
 from runtime.model.predictor import load_predictor
+from runtime.optics.pupil import PUPIL_MM
 from runtime.optics.quality import psnr_db
 from runtime.optics.real.cells import Cell, Curve
 from runtime.optics.real.panels import RealPanels
+from runtime.optics.real.trace import Tables, crossings
 from runtime.optics.stack import PanelStack
+from runtime.optics.views import image_from_camera, stack_from_eye
+from runtime.records import F32
 from runtime.report.crosstalk import (
     FALL_DB,
     NEAR_M,
@@ -38,6 +44,7 @@ from runtime.report.tolerance import (
     Bench,
     Cost,
     PanelMaker,
+    Subject,
     cell_at,
     filters_of,
     late_front,
@@ -46,13 +53,14 @@ from runtime.report.tolerance import (
     solved,
     together,
 )
-from runtime.report.tolerance_picture import seen_figure
 
 SCENE, DISTANCE_M, HEIGHT_M = "room", 0.6, 0.03  # content and head position without --pairs
 LOOKS = {33: "hard to distinguish from the target", 27: "a good picture with faint traces of the other layers",
          21: "obvious ghosts and coloured edges", -math.inf: "the layers fall apart"}  # fmt: skip
 BACKLIGHT_FALLOFF = 0.2
 REFRESH_MS = 1e3 / 60
+CROP_PX = (160, 120)  # width and height of the part in the middle of the left eye's picture that is shown
+RAYS_PASSED = 18  # rays per pixel that pass all panels, about
 CURVES: tuple[Curve, Curve] = ("intensity", "angle")  # grey curve calibrated without and with the angles
 Progress = Callable[[str], None]
 NOTE = (
@@ -408,3 +416,40 @@ def freedom_section(still: dict[str, Any], followed: Sequence[dict[str, float]])
         "Without tracking, the eyes must stay close to where the layers were computed for. Tracking frees the head."
     ]
     return PageSection("Viewing freedom", text, tables=tables)
+
+
+def seen_through(
+    subject: Subject, real: RealPanels, rays: int = RAYS_PASSED, size_px: tuple[int, int] = CROP_PX
+) -> F32:
+    """Return a crop of what the left eye sees through panels, relative to full white, from 0 to 1."""
+    pair, random = subject.pair, np.random.default_rng(2)
+    stack, eye_m, pose = pair.stack, pair.eyes_m[0], stack_from_eye(pair.eyes_m[0])
+    height, width = pair.images[0].shape[:2]
+    focal_px = image_from_camera(width_px=width, height_px=height, fov_deg=pair.fov_deg)[0, 0]
+    columns, rows = min(size_px[0], width), min(size_px[1], height)
+    corner = np.array([(height - rows) // 2, (width - columns) // 2])
+    v, u = np.mgrid[0:rows, 0:columns].reshape(2, -1) + corner[:, None]
+    tables, light, white = Tables(subject.layers, stack, real), np.zeros((len(u), 3)), np.zeros((len(u), 3))
+    for _ in range(math.ceil(rays / real.optics.passed)):
+        place = random.random((2, len(u)))
+        radius = PUPIL_MM / 2e3 * np.sqrt(random.random(len(u)))
+        angle = 2 * np.pi * random.random(len(u))
+        start_m = eye_m + np.outer(radius * np.cos(angle), pose[:3, 0]) + np.outer(radius * np.sin(angle), pose[:3, 1])
+        gaze = np.stack([u + place[0] - width / 2, height / 2 - v - place[1]], -1) / focal_px
+        gaze = gaze @ pose[:3, :2].T - pose[:3, 2]
+        middle_m = eye_m + gaze * ((stack.x_m[stack.count // 2] - eye_m[0]) / gaze[:, :1])
+        both = tables.light(crossings(start_m, middle_m, stack, real, random), float(eye_m[0]))
+        light, white = light + both[0], white + both[1]
+    veil = real.lighting.veil
+    seen = (light / white.mean(axis=0) + veil) / (1 + veil)
+    return np.asarray(seen.reshape(rows, columns, 3).clip(0, 1), np.float32)
+
+
+def seen_figure(subject: Subject, panels: Sequence[tuple[str, RealPanels]]) -> Figure:
+    """Return a figure of what the left eye sees through each of the named panels."""
+    with drawing(12.0, 3.2) as figure:
+        for axes, (name, real) in zip(figure.subplots(1, len(panels)), panels, strict=True):
+            axes.imshow(seen_through(subject, real), interpolation="nearest")
+            axes.set(xticks=[], yticks=[])
+            axes.set_title(name, fontsize=10)
+        return Figure("seen-left", png(figure), "The middle of what the left eye sees.")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib.robust import fit_robust
+from calib.similarity import fit_robust
 from calib.solution import METHODS, Method, design_covariance, solve, solve_default
 from calib.viewpoints import grid, viewing_volume_m
 from tests.calib.camera import KNOWN_M, measured

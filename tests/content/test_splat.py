@@ -15,9 +15,8 @@ from plyfile import PlyData, PlyElement
 from runtime.config import ContentSettings
 from runtime.content import splat
 from runtime.content.base import ContentInfo
-from runtime.content.compressed_splats import load_compressed_splats
+from runtime.content.compressed_splats import load_compressed, load_compressed_splats, load_splat
 from runtime.content.gaussians import Gaussians, harmonic_basis, load_gaussians
-from runtime.content.packed_splats import load_compressed, load_splat
 from runtime.content.placing import SceneFile
 from runtime.content.ply import read_header
 from runtime.content.registry import prepare_content

@@ -25,12 +25,11 @@ from calib.pairs import read_pairs
 from calib.setup_run import read_progress
 from runtime.clock import MonotonicClock, SimulatedClock
 from runtime.config import ContentSettings, Settings, load_settings, load_stack
-from runtime.content.compressed_splats import load_compressed_splats
+from runtime.content.compressed_splats import load_compressed, load_compressed_splats, load_splat
 from runtime.content.frames import open_frames
 from runtime.content.gaussians import bounds, load_gaussians, of_points
 from runtime.content.layout import layout_of
 from runtime.content.mesh import load_mesh
-from runtime.content.packed_splats import load_compressed, load_splat
 from runtime.content.parts import merged
 from runtime.content.placing import SceneFile
 from runtime.content.playlist import read_playlist

@@ -37,8 +37,7 @@ from runtime.report.tolerance import (
     solved,
     together,
 )
-from runtime.report.tolerance_page import LOOKS, assumption, cost_entry, geometry
-from runtime.report.tolerance_picture import seen_through
+from runtime.report.tolerance_page import LOOKS, assumption, cost_entry, geometry, seen_through
 from tests.test_contracts import fields_of
 
 
