@@ -12,11 +12,17 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
+from runtime.config import ContentSettings
 from runtime.content import registry
 from runtime.content.base import View
+from runtime.content.registry import open_content
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.views import image_from_stack, raster_from_stack
 from runtime.support.gl import offscreen_context
+
+STACK = PanelStack(
+    0.5184, 0.2916, (-0.06, 0.0, 0.06), 480, 270
+)  # the paper's display at a quarter of its pixels each way
 
 
 @pytest.fixture(scope="session")
@@ -49,9 +55,30 @@ def is_usable(context: Any) -> bool:
 
 
 @pytest.fixture
-def stack() -> PanelStack:
-    """The paper's display at a quarter of its pixels each way."""
-    return PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 480, 270)
+def opened(context: Any) -> Iterator[Callable[..., Any]]:
+    """Opens a scene, a file or a folder with further settings of content, until the test ends."""
+    sources = []
+
+    def open_scene(scene: object, **settings: Any) -> Any:
+        sources.append(open_content(ContentSettings(scene=str(scene), **settings), STACK, context))
+        return sources[-1]
+
+    yield open_scene
+    for source in sources:
+        source.close()
+
+
+@pytest.fixture
+def drawn(opened: Any) -> Callable[..., np.ndarray]:
+    """Opens a scene as `opened`, and draws it for an eye in the pixels of the middle panel."""
+
+    def draw(
+        scene: object, eye_m: ArrayLike = (0.6, 0, 0), side: int = 0, time_ns: int = 0, **settings: Any
+    ) -> np.ndarray:
+        view = panel_view(eye_m, STACK.panel(1), side)
+        return np.array(opened(scene, **settings).render(view, time_ns=time_ns))
+
+    return draw
 
 
 @pytest.fixture(autouse=True)

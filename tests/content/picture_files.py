@@ -72,11 +72,6 @@ def _shifted(meta: bytes, *, by: int) -> bytes:
     return bytes(out)
 
 
-def profiled(path: Path, codes: U8, profile: bytes) -> Path:
-    Image.fromarray(codes).save(path, icc_profile=profile)
-    return path
-
-
 def swapped_profile() -> bytes:
     """sRGB's profile with red and green exchanged: its effect is obvious."""
     from PIL import ImageCms

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -13,7 +12,6 @@ import pytest
 
 from runtime.config import ContentSettings, StackGeometry
 from runtime.content.comfort import adjusted, disparities
-from runtime.content.placed import Placing, placed_source
 from runtime.content.registry import open_content
 from runtime.plan.drawing import raster_views
 from tests.waiting import eventually
@@ -79,12 +77,3 @@ def test_a_pipe_is_shown_within_the_limit(tmp_path: Path, comfort_deg: float) ->
         expected = (20 / 480, 40 / 480) if not comfort_deg else (most - 20 / 480, most)
         assert found == pytest.approx(expected, abs=0.006)
         source.close()
-
-
-def test_the_limit_can_be_changed_while_it_runs() -> None:
-    inner = open_content(ContentSettings(scene="program"), STACK, None)
-    placed: Any = placed_source(inner, Placing(comfort_deg=1.0))
-    view = raster_views(EYES, STACK.panel(1))[0]
-    assert placed.forwarded(view, 0)[1].comfort_deg == 1.0
-    assert placed_source(placed, Placing()) is inner and view.comfort_deg == 0.0
-    inner.close()

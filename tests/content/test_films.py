@@ -16,12 +16,10 @@ from runtime.config import ContentSettings
 from runtime.content.frames import Video
 from runtime.content.pictures import PicturesSource, open_frames
 from runtime.content.placing import SceneFile
-from runtime.content.registry import open_content
 from runtime.errors import InputError
-from runtime.optics.stack import PanelStack
 from runtime.records import U8
 from runtime.support.film import Film, FilmWriter
-from tests.content.conftest import panel_view
+from tests.content.conftest import STACK, panel_view
 
 MS = 1_000_000
 AUTO = ContentSettings()
@@ -147,13 +145,13 @@ def test_a_recording_of_unknown_length_is_played_to_its_end(tmp_path: Path) -> N
     assert np.abs(np.array(played(path, [0, 150, 750, 850])) - [20, 40, 160, 20]).max() < 8
 
 
-def test_a_films_pixels_have_the_shape_that_it_declares(tmp_path: Path, stack: PanelStack) -> None:
+def test_a_films_pixels_have_the_shape_that_it_declares(tmp_path: Path) -> None:
     """A square of 4:3 pixels is a third wider than high."""
     picture = grey(0, 96, 96)
     picture[24:72, 24:72] = 255
     path = write(tmp_path / "a.mp4", [(0, picture), (100, picture)], aspect=Fraction(4, 3))
-    source = PicturesSource(open_frames(path, AUTO), file=SceneFile(path, AUTO, stack))
-    shown = source.render(panel_view((0.6, 0.0, 0.0), stack.panel(1)), time_ns=0)[..., 0] > 128
+    source = PicturesSource(open_frames(path, AUTO), file=SceneFile(path, AUTO, STACK))
+    shown = source.render(panel_view((0.6, 0.0, 0.0), STACK.panel(1)), time_ns=0)[..., 0] > 128
     wide, high = np.ptp(np.nonzero(shown.any(0))[0]) + 1, np.ptp(np.nonzero(shown.any(1))[0]) + 1
     assert wide / high == pytest.approx(4 / 3, rel=0.03)
 
@@ -216,14 +214,6 @@ def test_a_frame_packing_that_only_h264_declares_is_used(tmp_path: Path) -> None
     assert frames.layout(0).half
 
 
-def test_a_film_whose_halves_are_alike_gets_the_hint_of_stills(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    view = np.random.default_rng(0).integers(0, 255, (9, 16, 3)).astype(np.uint8).repeat(20, 0).repeat(20, 1)
-    open_frames(write(tmp_path / "a.mp4", [(0, np.concatenate([view, view], axis=1))]), AUTO).close()
-    assert "a.mp4: the halves are almost the same; if they are two views, pass --layout side-by-side" in caplog.text
-
-
 def test_the_cover_of_an_audio_file_is_a_still(tmp_path: Path) -> None:
     path = write(tmp_path / "a.mp4", [(0, grey(90))], codec="mjpeg", pix_fmt="yuvj420p")
     data = path.read_bytes()
@@ -268,12 +258,12 @@ def test_a_written_film_has_the_times_of_its_pictures(tmp_path: Path) -> None:
     assert (Film(tmp_path / "a.mp4").times_ns[:4] // MS).tolist() == [0, 33, 100, 400]
 
 
-def test_a_scene_may_be_a_file_url(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+def test_a_scene_may_be_a_file_url(opened: Any, tmp_path: Path) -> None:
     path = write(tmp_path / "a film é.mp4", [(0, grey(90))])
-    source = open_content(ContentSettings(scene=path.as_uri()), stack, context)
+    source = opened(path.as_uri())
     assert source.info.name == "a film é"
     with pytest.raises(InputError, match="is on another computer; mount the share"):
-        open_content(ContentSettings(scene="smb://nas/films/a.mp4"), stack, context)
+        opened("smb://nas/films/a.mp4")
 
 
 def test_a_film_in_an_unknown_code_is_refused_in_one_line(tmp_path: Path) -> None:

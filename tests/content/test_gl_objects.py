@@ -12,8 +12,7 @@ import trimesh
 
 from runtime.config import ContentSettings
 from runtime.content.registry import prepare_content
-from runtime.optics.stack import PanelStack
-from tests.content.conftest import panel_view
+from tests.content.conftest import STACK, panel_view
 from tests.content.test_splat import splat_table, written
 
 MAKERS = ("buffer", "texture", "vertex_array", "program", "framebuffer", "renderbuffer", "depth_renderbuffer")
@@ -55,13 +54,11 @@ def scene_of(kind: str, folder: Path) -> str:
 
 
 @pytest.mark.parametrize("kind", ["moving", "mesh", "splats"])
-def test_a_closed_source_has_released_every_object_that_it_made(
-    context: Any, stack: PanelStack, tmp_path: Path, kind: str
-) -> None:
+def test_a_closed_source_has_released_every_object_that_it_made(context: Any, tmp_path: Path, kind: str) -> None:
     counting = Counting(context)
-    source = prepare_content(ContentSettings(scene=scene_of(kind, tmp_path)), stack)(context=counting)
+    source = prepare_content(ContentSettings(scene=scene_of(kind, tmp_path)), STACK)(context=counting)
     for side, y_m in enumerate((-0.03, 0.03)):
-        source.render(panel_view(np.array([0.7, y_m, 0.0]), stack.panel(1), side), time_ns=0)
+        source.render(panel_view(np.array([0.7, y_m, 0.0]), STACK.panel(1), side), time_ns=0)
     assert len(counting.left) > 2
     source.close()
     source.close()

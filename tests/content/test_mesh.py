@@ -17,17 +17,12 @@ from runtime.content.mesh import load_mesh, prepare
 from runtime.content.parts import UNCOLOURED
 from runtime.content.placing import SceneFile, guessed_axes
 from runtime.content.triangles import TriangleSource
-from runtime.optics.stack import PanelStack
 from runtime.support.untrusted_input import LIMITS
 from tests.calls import refusal
-from tests.content.conftest import panel_view
+from tests.content.conftest import STACK, panel_view
 from tests.content.gltf_files import Buffer
 
 EYE = (0.7, 0.05, 0.1)
-
-
-def source_of(path: Path, context: Any, stack: PanelStack, **settings: Any) -> Any:
-    return prepare(SceneFile(path, ContentSettings(**settings), stack))(context=context)
 
 
 def textured_quad(folder: Path, suffix: str) -> Path:
@@ -49,9 +44,8 @@ def textured_quad(folder: Path, suffix: str) -> Path:
 
 
 @pytest.mark.parametrize("suffix", [".glb", ".obj"])
-def test_a_picture_is_upright_and_not_mirrored(tmp_path: Path, context: Any, stack: PanelStack, suffix: str) -> None:
-    source = source_of(textured_quad(tmp_path, suffix), context, stack)
-    picture = source.render(panel_view((0.7, 0.0, 0.0), stack.panel(1)), time_ns=0)
+def test_a_picture_is_upright_and_not_mirrored(tmp_path: Path, drawn: Any, suffix: str) -> None:
+    picture = drawn(textured_quad(tmp_path, suffix), (0.7, 0.0, 0.0))
     rows, columns = np.nonzero(picture[..., 3] == 255)
     top, bottom = rows.min() + 20, rows.max() - 20
     left, right = columns.min() + 20, columns.max() - 20
@@ -63,13 +57,12 @@ def test_a_picture_is_upright_and_not_mirrored(tmp_path: Path, context: Any, sta
 
 
 @pytest.mark.parametrize("suffix", [".glb", ".ply", ".obj"])
-def test_vertex_colours_are_kept(tmp_path: Path, context: Any, stack: PanelStack, suffix: str) -> None:
+def test_vertex_colours_are_kept(tmp_path: Path, drawn: Any, suffix: str) -> None:
     ball = trimesh.creation.icosphere(subdivisions=3)
     ball.visual.vertex_colors = np.tile([20, 200, 60, 255], (len(ball.vertices), 1))
     path = tmp_path / f"ball{suffix}"
     ball.export(path)
-    source = source_of(path, context, stack)
-    picture = source.render(panel_view(EYE, stack.panel(1)), time_ns=0)
+    picture = drawn(path, EYE)
     seen = picture[picture[..., 3] == 255][:, :3].astype(float)
     assert len(seen) > 1000
     # By custom they are codes; by glTF's text linear light.
@@ -78,16 +71,15 @@ def test_vertex_colours_are_kept(tmp_path: Path, context: Any, stack: PanelStack
     assert np.median(seen[:, 2] / seen[:, 1]) == pytest.approx(blue, abs=0.03)
 
 
-def test_a_vertex_lands_where_the_projection_says(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+def test_a_vertex_lands_where_the_projection_says(tmp_path: Path, drawn: Any) -> None:
     tip = np.array([[0.05, 0.1, 0.06]])
     cone = trimesh.Trimesh(
         [*tip, [0.0, 0.0, 0.0], [0.0, 0.02, 0.0], [0.0, 0.0, 0.02]], [[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]]
     )
     path = tmp_path / "cone.ply"
     cone.export(path)
-    source = source_of(path, context, stack, fit=False)
-    view = panel_view((0.6, 0.0, 0.0), stack.panel(1))
-    picture = source.render(view, time_ns=0)
+    view = panel_view((0.6, 0.0, 0.0), STACK.panel(1))
+    picture = drawn(path, fit=False)
     expected = project(view.pixels_from_stack, tip)[0][0]
     rows, columns = np.nonzero(picture[..., 3] > 0)
     farthest = columns.argmax()
@@ -101,14 +93,14 @@ def depth_of(source: TriangleSource) -> tuple[float, float]:
     return float(x_m.min()), float(x_m.max())
 
 
-def test_a_fitted_mesh_fills_the_display_or_its_depth(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+def test_a_fitted_mesh_fills_the_display_or_its_depth(tmp_path: Path, opened: Any) -> None:
     path = tmp_path / "box.glb"
     trimesh.creation.box((100.0, 20.0, 30.0)).export(path)
-    rear, front = depth_of(source_of(path, context, stack, depth_m=(-0.3, 0.3)))
+    rear, front = depth_of(opened(path, depth_m=(-0.3, 0.3)))
     assert front == pytest.approx(-rear)
-    assert front - rear == pytest.approx(30 * 0.75 * stack.width_m / 100, rel=1e-3)
+    assert front - rear == pytest.approx(30 * 0.75 * STACK.width_m / 100, rel=1e-3)
     # A shallow depth range starts at the front and may reach twice as deep.
-    rear, front = depth_of(source_of(path, context, stack, depth_m=(-0.01, 0.03)))
+    rear, front = depth_of(opened(path, depth_m=(-0.01, 0.03)))
     assert (rear, front) == pytest.approx((-0.05, 0.03), abs=1e-4)
 
 
@@ -131,27 +123,23 @@ CARD = [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]  # in the plane of two a
 
 @pytest.mark.parametrize("suffix", [".glb", ".obj", ".stl", ".ply"])
 @pytest.mark.parametrize("turns", [(0, 1, 2), (0, -2, 1), (0, 2, -1), (2, 1, -0.0), (-2, 1, 0), (-0.0, 1, -2)])
-def test_what_is_flat_shows_its_front(
-    tmp_path: Path, context: Any, stack: PanelStack, suffix: str, turns: tuple[float, ...]
-) -> None:
+def test_what_is_flat_shows_its_front(tmp_path: Path, opened: Any, suffix: str, turns: tuple[float, ...]) -> None:
     """A card of any orientation in its file fills the display's height with its front."""
     columns = [np.array(CARD)[:, abs(int(axis))] * (-1 if np.signbit(axis) else 1) for axis in turns]
     trimesh.Trimesh(np.column_stack(columns), [[0, 1, 2], [0, 2, 3]], process=False).export(tmp_path / f"a{suffix}")
-    source = source_of(tmp_path / f"a{suffix}", context, stack)
-    picture = source.render(panel_view((0.7, 0.0, 0.0), stack.panel(1)), time_ns=0)
-    assert (picture[..., 3] == 255).sum() > 0.9 * (0.75 * stack.height_px) ** 2
+    source = opened(tmp_path / f"a{suffix}")
+    picture = source.render(panel_view((0.7, 0.0, 0.0), STACK.panel(1)), time_ns=0)
+    assert (picture[..., 3] == 255).sum() > 0.9 * (0.75 * STACK.height_px) ** 2
     normals = source.parts[0].vertices[:, 3:6] @ source.stack_from_parts[0][:3, :3].T
     assert (normals[:, 0] > 0).all()
 
 
 @pytest.mark.parametrize(("suffix", "up"), [(".glb", "y"), (".obj", "y"), (".stl", "z")])
-def test_up_is_what_the_format_has_by_custom(
-    tmp_path: Path, context: Any, stack: PanelStack, suffix: str, up: str
-) -> None:
+def test_up_is_what_the_format_has_by_custom(tmp_path: Path, drawn: Any, suffix: str, up: str) -> None:
     """A pole along the file's up axis is upright at any offset."""
     pole = trimesh.creation.box((1, 5, 1) if up == "y" else (1, 1, 5))
     pole.export(tmp_path / f"a{suffix}")
-    picture = source_of(tmp_path / f"a{suffix}", context, stack).render(panel_view(EYE, stack.panel(1)), time_ns=0)
+    picture = drawn(tmp_path / f"a{suffix}", EYE)
     rows, columns = np.nonzero(picture[..., 3])
     assert np.ptp(rows) > 3 * np.ptp(columns)
 
@@ -179,14 +167,11 @@ def bottle(folder: Path, suffix: str) -> Path:
     return folder / f"bottle{suffix}"
 
 
-def test_the_same_bottle_from_obj_and_ply_is_alike_and_stands(tmp_path: Path, context: Any, stack: PanelStack) -> None:
-    pictures = []
-    for suffix in (".obj", ".ply"):
-        source = source_of(bottle(tmp_path, suffix), context, stack, axes="+z -y")
-        pictures.append(source.render(panel_view(EYE, stack.panel(1)), time_ns=0).astype(int).copy())
+def test_the_same_bottle_from_obj_and_ply_is_alike_and_stands(tmp_path: Path, drawn: Any) -> None:
+    pictures = [drawn(bottle(tmp_path, suffix), EYE, axes="+z -y").astype(int) for suffix in (".obj", ".ply")]
     assert np.abs(pictures[0] - pictures[1]).max() <= 2
     rows, columns = np.nonzero(pictures[0][..., 3] == 255)
-    assert np.ptp(rows) > 0.7 * stack.height_px and np.ptp(rows) > 2 * np.ptp(columns)
+    assert np.ptp(rows) > 0.7 * STACK.height_px and np.ptp(rows) > 2 * np.ptp(columns)
     middle = int(columns.mean())
     assert (
         pictures[0][rows.min() + 20, middle, :3].argmax() == 1
@@ -195,12 +180,12 @@ def test_the_same_bottle_from_obj_and_ply_is_alike_and_stands(tmp_path: Path, co
 
 
 def test_an_obj_without_its_materials_is_grey_and_a_line_says_so(
-    tmp_path: Path, context: Any, stack: PanelStack, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, drawn: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = textured_quad(tmp_path, ".obj")
     for beside in [*tmp_path.glob("*.mtl"), *tmp_path.glob("*.png")]:
         beside.unlink()
-    picture = source_of(path, context, stack).render(panel_view(EYE, stack.panel(1)), time_ns=0)
+    picture = drawn(path, EYE)
     seen = picture[picture[..., 3] == 255][:, :3].astype(int)
     assert len(seen) > 1000 and np.ptp(seen, axis=1).max() < 30
     assert f"{path}: drawing the mesh in grey without its materials because " in caplog.text
@@ -254,20 +239,15 @@ def test_an_obj_of_two_bytes_a_letter_is_read(tmp_path: Path, code: str) -> None
 
 @pytest.mark.parametrize(("most", "outlined"), [(24, True), (23, False)])
 def test_a_file_of_many_triangles_is_drawn_without_outlines(
-    tmp_path: Path, stack: PanelStack, monkeypatch: pytest.MonkeyPatch, most: int, outlined: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int, outlined: bool
 ) -> None:
     """All parts count: a million triangles in five took 2.3 GB and 4.6 s a picture."""
     monkeypatch.setattr(mesh, "OUTLINED_MAX", most)
     lit, unlit = trimesh.creation.box(), trimesh.creation.box()
     lit.visual = trimesh.visual.TextureVisuals(material=trimesh.visual.material.PBRMaterial(alphaMode="MASK"))
     trimesh.Scene([lit, unlit]).export(tmp_path / "a.glb")
-    parts = prepare(SceneFile(tmp_path / "a.glb", ContentSettings(), stack)).args[0]
+    parts = prepare(SceneFile(tmp_path / "a.glb", ContentSettings(), STACK)).args[0]
     assert len(parts) == 2 and all((part.edges is not None) == outlined for part in parts)
-
-
-def test_an_off_file_is_read(tmp_path: Path) -> None:
-    trimesh.creation.box().export(tmp_path / "a.off")
-    assert len(load_mesh(tmp_path / "a.off").parts[0].shape.triangles) == 12
 
 
 def test_a_ply_with_coordinates_of_no_texture_is_as_one_without(tmp_path: Path) -> None:
@@ -278,7 +258,7 @@ def test_a_ply_with_coordinates_of_no_texture_is_as_one_without(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".gltf"])
-def test_points_are_drawn_in_their_colours(tmp_path: Path, context: Any, stack: PanelStack, suffix: str) -> None:
+def test_points_are_drawn_in_their_colours(tmp_path: Path, drawn: Any, suffix: str) -> None:
     places = np.stack(np.meshgrid(np.linspace(-1, 1, 40), np.linspace(-1, 1, 40)), -1).reshape(-1, 2)
     places = np.column_stack([places, 0 * places[:, 0]])
     path = tmp_path / f"a{suffix}"
@@ -290,15 +270,14 @@ def test_points_are_drawn_in_their_colours(tmp_path: Path, context: Any, stack: 
         b = Buffer()
         colours = np.tile([0.71, 0.02, 0.02], (len(places), 1))  # linear
         b.write(path, {"attributes": {"POSITION": b.add(places), "COLOR_0": b.add(colours)}, "mode": 0})
-    source = source_of(path, context, stack, axes="+y +z")
-    picture = source.render(panel_view((0.7, 0.0, 0.0), stack.panel(1)), time_ns=0)
+    picture = drawn(path, (0.7, 0.0, 0.0), axes="+y +z")
     seen = picture[60:200, 180:300]
     assert seen[..., 3].min() > 100
     assert np.median(seen[..., 0]) > 150 and np.median(seen[..., 1]) < 80
 
 
 @pytest.mark.parametrize("form", ["obj", 1, 2, 3])
-def test_lines_alone_are_drawn(tmp_path: Path, context: Any, stack: PanelStack, form: Any) -> None:
+def test_lines_alone_are_drawn(tmp_path: Path, drawn: Any, form: Any) -> None:
     """A square's outline: its edges are seen, its middle is not."""
     path = tmp_path / ("a.obj" if form == "obj" else "a.gltf")
     if form == "obj":
@@ -307,23 +286,27 @@ def test_lines_alone_are_drawn(tmp_path: Path, context: Any, stack: PanelStack, 
         b = Buffer()
         corners = {1: [0, 1, 1, 2, 2, 3, 3, 0], 2: [0, 1, 2, 3], 3: [0, 1, 2, 3, 0]}[form]
         b.write(path, {"attributes": {"POSITION": b.add(CARD)}, "indices": b.add(corners, np.uint8), "mode": form})
-    covered = source_of(path, context, stack).render(panel_view((0.7, 0, 0), stack.panel(1)), time_ns=0)[..., 3]
+    covered = drawn(path, (0.7, 0, 0))[..., 3]
     rows, columns = np.nonzero(covered > 128)
-    side = 0.75 * stack.height_px
+    side = 0.75 * STACK.height_px
     assert np.ptp(rows) == pytest.approx(side, abs=8) and np.ptp(columns) == pytest.approx(side, abs=8)
     assert covered[135, 240] == 0 and (covered[rows.min() : rows.max(), columns.min() + 1] > 128).mean() > 0.95
 
 
-def test_colours_of_an_off_file_are_said_to_be_left_out(tmp_path: Path) -> None:
-    (tmp_path / "a.off").write_text("COFF\n3 1 0\n0 0 0 255 0 0 255\n1 0 0 0 255 0 255\n0 1 0 0 0 255 255\n3 0 1 2\n")
-    assert load_mesh(tmp_path / "a.off").left_out == ("colours",)
+STRIPS = "ply\nformat ascii 1.0\nWritten by somebody\nelement vertex 3\nproperty float x\nproperty float y\n"
+STRIPS += "property float z\nelement tristrips 1\nproperty list int int vertex_indices\nend_header\n"
+COLOURED = "COFF\n3 1 0\n0 0 0 255 0 0 255\n1 0 0 0 255 0 255\n0 1 0 0 0 255 255\n3 0 1 2\n"
 
 
-def test_strips_of_a_ply_are_said_to_be_left_out(tmp_path: Path) -> None:
-    head = "ply\nformat ascii 1.0\nWritten by somebody\nelement vertex 3\nproperty float x\nproperty float y\n"
-    head += "property float z\nelement tristrips 1\nproperty list int int vertex_indices\nend_header\n"
-    (tmp_path / "a.ply").write_text(head + "0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
-    assert load_mesh(tmp_path / "a.ply").left_out == ("tristrips",)
+@pytest.mark.parametrize(
+    ("name", "text", "left_out"),
+    [("a.off", COLOURED, "colours"), ("a.ply", STRIPS + "0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "tristrips")],
+)
+def test_what_a_mesh_file_has_besides_is_said_to_be_left_out(
+    tmp_path: Path, name: str, text: str, left_out: str
+) -> None:
+    (tmp_path / name).write_text(text)
+    assert load_mesh(tmp_path / name).left_out == (left_out,)
 
 
 CLOUD = "ply\nformat ascii 1.0\nelement vertex 0\n" + "".join(f"property float {axis}\n" for axis in "xyz")
@@ -350,11 +333,8 @@ TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
         ("a.stl", "", "faces: the file contains no faces"),
         ("a.ply", CLOUD, "faces: the file contains no faces"),
         ("a.stl", "\0" * 84, "faces: the file contains no faces"),
-        *(
-            (f"a{suffix}", data, "")
-            for suffix in (".glb", ".gltf", ".ply", ".obj")
-            for data in ("", "x", "glTF\2\0\0\0")
-        ),
+        *(("a.glb", data, "is not a glTF file, or is damaged; export it again") for data in ("", "junk\n", "\0" * 64)),
+        *((f"a{suffix}", data, "") for suffix in (".gltf", ".ply", ".obj") for data in ("", "x", "glTF\2\0\0\0")),
     ],
 )
 def test_a_broken_file_is_one_line_that_names_the_field(
@@ -380,12 +360,9 @@ FAR = np.array([4.5e6, 5.4e6, 300.0])  # an offset as in UTM coordinates
 
 
 @pytest.mark.parametrize("suffix", [".obj", ".off", ".ply"])
-def test_a_mesh_far_from_its_origin_looks_as_one_there(
-    tmp_path: Path, context: Any, stack: PanelStack, suffix: str
-) -> None:
+def test_a_mesh_far_from_its_origin_looks_as_one_there(tmp_path: Path, drawn: Any, suffix: str) -> None:
     """float32 has a spacing of 0.5 at these coordinates, and the ball a radius of 1."""
     ball = trimesh.creation.icosphere(subdivisions=2)
-    view = panel_view(EYE, stack.panel(1))
     pictures = []
     for name, offset in (("near", 0 * FAR), ("far", FAR)):
         vertices = "".join(("v " if suffix == ".obj" else "") + f"{x} {y} {z}\n" for x, y, z in ball.vertices + offset)
@@ -400,13 +377,12 @@ def test_a_mesh_far_from_its_origin_looks_as_one_there(
         }[suffix]
         path = tmp_path / f"{name}{suffix}"
         path.write_text(head + vertices + faces)
-        source = source_of(path, context, stack, axes="+z +x")
-        pictures.append(source.render(view, time_ns=0).astype(int))
+        pictures.append(drawn(path, EYE, axes="+z +x").astype(int))
     assert (pictures[0][..., 3] == 255).sum() > 1000
     assert np.abs(pictures[0] - pictures[1]).max() <= 2
 
 
-def test_points_far_from_their_origin_look_as_those_there(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+def test_points_far_from_their_origin_look_as_those_there(tmp_path: Path, drawn: Any) -> None:
     points = trimesh.creation.icosphere(subdivisions=3).vertices
     pictures = []
     for name, offset in (("near", 0 * FAR), ("far", FAR)):
@@ -416,18 +392,17 @@ def test_points_far_from_their_origin_look_as_those_there(tmp_path: Path, contex
             (head + "".join(f"property double {axis}\n" for axis in "xyz") + "end_header\n").encode()
             + (points + offset).astype("<f8").tobytes()
         )
-        source = source_of(path, context, stack, axes="+z +x")
-        pictures.append(source.render(panel_view(EYE, stack.panel(1)), time_ns=0).astype(int))
+        pictures.append(drawn(path, EYE, axes="+z +x").astype(int))
     assert (pictures[0][..., 3] > 128).sum() > 1000
     assert np.abs(pictures[0] - pictures[1]).max() <= 2
 
 
-def test_a_binary_stl_far_from_its_origin_is_centred(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+def test_a_binary_stl_far_from_its_origin_is_centred(tmp_path: Path, opened: Any) -> None:
     """Its float32 corners are exact; what is drawn with must not round them again."""
     box = trimesh.creation.box((2.0, 1.0, 1.0))
     box.apply_translation([2.0**23, 0, 0])
     box.export(tmp_path / "far.stl")
-    source = source_of(tmp_path / "far.stl", context, stack)
+    source = opened(tmp_path / "far.stl")
     (part,) = source.parts
     assert np.ptp(part.positions, axis=0).tolist() == [2.0, 1.0, 1.0]
     assert np.abs(part.positions).max() <= 1.0 and np.abs(source.stack_from_parts[0][:3, 3]).max() < 1.0

@@ -9,16 +9,13 @@ import numpy as np
 import pytest
 
 from runtime.clock import NS_PER_S
-from runtime.config import ContentSettings
 from runtime.content.base import ContentInfo, ContentSource, View
 from runtime.content.parts import Part
-from runtime.content.registry import open_content
 from runtime.content.shapes import card, rotation_about
 from runtime.content.splat import SplatSource
 from runtime.content.triangles import DrawnPart, TriangleSource
-from runtime.optics.stack import PanelStack
 from runtime.support.artifacts import write_png
-from tests.content.conftest import panel_view
+from tests.content.conftest import STACK, panel_view
 from tests.content.test_splat import loaded, splat_table, written
 
 EYES = ((0.6, 0.02, 0.03), (0.35, -0.2, 0.1))
@@ -46,14 +43,12 @@ def drawn(source: ContentSource, view: View) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("eye", EYES)
 @pytest.mark.parametrize("samples", [0, 4])
-def test_a_tilted_card_is_as_far_as_rays_meet_its_plane(
-    context: Any, stack: PanelStack, eye: tuple[float, ...], samples: int
-) -> None:
+def test_a_tilted_card_is_as_far_as_rays_meet_its_plane(context: Any, eye: tuple[float, ...], samples: int) -> None:
     turn, place = rotation_about(2, 0.5) @ rotation_about(1, 0.4), np.eye(4)
     place[:3, :3], place[:3, 3] = turn, (0.03, 0.02, -0.01)
     part = DrawnPart(Part(card(0.3, 0.2)), outlined=not samples)
     source = TriangleSource([part], [place], context=context, info=ContentInfo("a"), samples=samples)
-    view = panel_view(eye, stack.panel(1))
+    view = panel_view(eye, STACK.panel(1))
     found, inner = drawn(source, view)
     expected = plane_nearness(view, place[:3, 3], turn[:, 0])
     anywhere_in_it = np.abs(np.gradient(expected)).sum(0) / 2  # of several samples one is read
@@ -63,25 +58,21 @@ def test_a_tilted_card_is_as_far_as_rays_meet_its_plane(
     source.close()
 
 
-def test_an_rgbd_picture_has_the_depths_of_its_map(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+def test_an_rgbd_picture_has_the_depths_of_its_map(tmp_path: Path, opened: Any) -> None:
     """Drawn with several samples a pixel: left half in front, right half behind."""
     picture = np.full((90, 320, 3), 120, np.uint8)
     picture[:, 160:240], picture[:, 240:] = 255, 0
     write_png(tmp_path / "a_rgbd.png", picture)
-    settings = ContentSettings(scene=str(tmp_path / "a_rgbd.png"), depth_m=(-0.05, 0.05))
-    source = open_content(settings, stack, context)
-    view = panel_view(EYES[0], stack.panel(1))
+    source = opened(tmp_path / "a_rgbd.png", depth_m=(-0.05, 0.05))
+    view = panel_view(EYES[0], STACK.panel(1))
     found, _ = drawn(source, view)
     for columns, x_m in ((slice(60, 180), 0.05), (slice(320, 420), -0.05)):
         expected = plane_nearness(view, np.array([x_m, 0, 0]), np.array([1.0, 0, 0]))
         np.testing.assert_allclose(found[40:230, columns], expected[40:230, columns], rtol=1e-4)
-    source.close()
 
 
 @pytest.mark.parametrize("opacity", [6.0, 0.5])
-def test_a_sheet_of_splats_is_as_far_as_its_plane(
-    tmp_path: Path, context: Any, stack: PanelStack, opacity: float
-) -> None:
+def test_a_sheet_of_splats_is_as_far_as_its_plane(tmp_path: Path, context: Any, opacity: float) -> None:
     """Dense splats in one plane; fainter ones before it are seen through and do not count."""
     table = splat_table(6000, degree=0)
     table["opacity"], table["z"] = opacity, 0.04 + 0.1 * table["y"]
@@ -93,7 +84,7 @@ def test_a_sheet_of_splats_is_as_far_as_its_plane(
         info=ContentInfo("a"),
     )  # fmt: skip
     source._gaussians.centres[:] = source._gaussians.centres[:, [2, 1, 0]]
-    view = panel_view(EYES[0], stack.panel(1))
+    view = panel_view(EYES[0], STACK.panel(1))
     found, _ = drawn(source, view)
     expected = plane_nearness(view, np.array([0.004, 0, 0]), np.array([1.0, -0.1, 0]))
     middle = (slice(60, 210), slice(150, 330))
@@ -107,24 +98,23 @@ def test_a_sheet_of_splats_is_as_far_as_its_plane(
     source.close()
 
 
-def test_a_source_without_depth_has_none(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+def test_a_source_without_depth_has_none(tmp_path: Path, opened: Any) -> None:
     write_png(tmp_path / "a.png", np.full((90, 160, 3), 90, np.uint8))
-    source = open_content(ContentSettings(scene=str(tmp_path / "a.png"), rotation_deg=(0, 5, 0)), stack, context)
-    view = panel_view(EYES[0], stack.panel(1))
+    source = opened(tmp_path / "a.png", rotation_deg=(0, 5, 0))
+    view = panel_view(EYES[0], STACK.panel(1))
     assert source.nearness(view, **WHOLE) is None
     source.render(view, time_ns=0)
     assert source.nearness(view, **WHOLE) is None
-    source.close()
 
 
-def test_a_playlist_has_the_depth_of_what_it_shows(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+def test_a_playlist_has_the_depth_of_what_it_shows(tmp_path: Path, opened: Any) -> None:
     write_png(tmp_path / "a.png", np.full((90, 160, 3), 90, np.uint8))
     (tmp_path / "list.toml").write_text(
         "[[show]]\nscene = 'demo'\nseconds = 2\nscale = 0.8\n[[show]]\nscene = 'a.png'\nseconds = 2\n"
     )
-    shown = open_content(ContentSettings(scene=str(tmp_path / "list.toml")), stack, context)
-    alone = open_content(ContentSettings(scene="demo", scale=0.8), stack, context)
-    view = panel_view(EYES[0], stack.panel(1))
+    shown = opened(tmp_path / "list.toml")
+    alone = opened("demo", scale=0.8)
+    view = panel_view(EYES[0], STACK.panel(1))
     assert shown.nearness(view, **WHOLE) is None
     for source in (shown, alone):
         source.render(view, time_ns=0)
@@ -134,5 +124,3 @@ def test_a_playlist_has_the_depth_of_what_it_shows(tmp_path: Path, context: Any,
     np.testing.assert_array_equal(first, expected)
     shown.render(view, time_ns=3 * NS_PER_S)
     assert shown.nearness(view, **WHOLE) is None
-    for source in (shown, alone):
-        source.close()

@@ -15,7 +15,7 @@ from runtime.content.placed import PlacedSource, Placing, placed_source
 from runtime.content.registry import open_content
 from runtime.optics.stack import PanelStack
 from runtime.support.artifacts import write_png
-from tests.content.conftest import panel_view
+from tests.content.conftest import STACK, panel_view
 
 EYE = (0.6, 0.02, 0.03)
 
@@ -26,35 +26,27 @@ def middle_of(picture: np.ndarray) -> np.ndarray:
     return np.array([columns.mean() + 0.5, rows.mean() + 0.5])
 
 
-def drawn(context: Any, stack: PanelStack, scene: str = "sparse", time_ns: int = 0, **settings: Any) -> np.ndarray:
-    source = open_content(ContentSettings(scene=scene, **settings), stack, context)
-    picture = source.render(panel_view(EYE, stack.panel(1)), time_ns=time_ns).copy()
-    source.close()
-    return picture
-
-
-def test_an_offset_moves_it_to_where_the_projection_says(context: Any, stack: PanelStack) -> None:
+def test_an_offset_moves_it_to_where_the_projection_says(drawn: Any) -> None:
     offset = np.array([0.03, 0.08, -0.05])
-    there = middle_of(drawn(context, stack, offset_m=tuple(offset)))
-    view = panel_view(EYE, stack.panel(1))
+    there = middle_of(drawn("sparse", EYE, offset_m=tuple(offset)))
+    view = panel_view(EYE, STACK.panel(1))
     centre = np.array([0.02, 0.03, 0.0])  # of the ring
     expected = project(view.pixels_from_stack, (centre + offset)[None])[0][0]
     assert np.abs(there - expected).max() < 2.5
 
 
-def test_convergence_moves_the_views_apart_by_itself(context: Any, stack: PanelStack) -> None:
-    views = [panel_view(EYE, stack.panel(1), side=side) for side in (0, 1)]
+def test_convergence_moves_the_views_apart_by_itself(opened: Any) -> None:
+    views = [panel_view(EYE, STACK.panel(1), side=side) for side in (0, 1)]
     places = []
     for convergence_m in (0.0, 0.02):
-        source = open_content(ContentSettings(scene="sparse", convergence_m=convergence_m), stack, context)
+        source = opened("sparse", convergence_m=convergence_m)
         places.append([middle_of(source.render(view, time_ns=0).copy()) for view in views])
-        source.close()
-    apart = (np.array(places[1]) - places[0])[:, 0] * stack.width_m / stack.width_px
+    apart = (np.array(places[1]) - places[0])[:, 0] * STACK.width_m / STACK.width_px
     assert apart == pytest.approx([-0.01, 0.01], abs=0.001)
 
 
-def test_scale_is_about_the_displays_middle(context: Any, stack: PanelStack) -> None:
-    small, large = (drawn(context, stack, scale=scale) for scale in (0.5, 1.5))
+def test_scale_is_about_the_displays_middle(drawn: Any) -> None:
+    small, large = (drawn("sparse", EYE, scale=scale) for scale in (0.5, 1.5))
     areas = [(picture[..., 3] == 255).sum() for picture in (small, large)]
     assert areas[1] / areas[0] == pytest.approx(9, rel=0.15)
 
@@ -72,27 +64,26 @@ def test_a_turn_about_the_axis_out_of_the_screen_turns_the_picture(tmp_path: Pat
     assert source.info.flat_x_m == 0.0
 
 
-def test_a_turntable_turns_by_the_clock(context: Any, stack: PanelStack) -> None:
-    source = open_content(ContentSettings(scene="sparse", turntable_per_min=6), stack, context)
+def test_a_turntable_turns_by_the_clock(opened: Any) -> None:
+    source = opened("sparse", turntable_per_min=6)
     assert isinstance(source, PlacedSource) and source.info.moving
-    view = panel_view(EYE, stack.panel(1))
+    view = panel_view(EYE, STACK.panel(1))
     pictures = [source.render(view, time_ns=second * NS_PER_S).copy() for second in (0, 5, 10)]
     assert (pictures[0] != pictures[1]).any()
     assert (pictures[0] == pictures[2]).all()  # six turns a minute
     assert source.revision(time_ns=1) != source.revision(time_ns=2)
     assert placed_source(source, Placing()) is source.source  # a new placement replaces the old one
-    source.close()
 
 
-def test_the_lamp_stands_still_while_the_scene_turns(context: Any, stack: PanelStack) -> None:
+def test_the_lamp_stands_still_while_the_scene_turns(context: Any) -> None:
     """A ball without a picture looks alike from everywhere, if the lamp doesn't turn with it."""
     from runtime.content import shapes
     from runtime.content.procedural import ProceduralSource
     from runtime.content.scenes import Scene, Thing
 
     ball = Scene("ball", (Thing(shapes.sphere(0.05), "plain", (0.0, 0.0, 0.0), (0.5, 0.5, 0.5)),))
-    inner = ProceduralSource(ball, stack=stack, context=context)
-    view = panel_view((0.6, 0, 0), stack.panel(1))
+    inner = ProceduralSource(ball, stack=STACK, context=context)
+    view = panel_view((0.6, 0, 0), STACK.panel(1))
     stands = inner.render(view, time_ns=0).astype(int)
     turned = PlacedSource(inner, Placing(rotation_deg=(0, 0, 90))).render(view, time_ns=0).astype(int)
     inside = (stands[..., 3] == 255) & (turned[..., 3] == 255)
@@ -108,14 +99,12 @@ def test_a_picture_turned_edge_on_is_the_background_and_no_error(tmp_path: Path,
     assert (turned.render(panel_view((0.6, 0, 0), stack.panel(1)), time_ns=0) == (31, 31, 31, 0)).all()
 
 
-def test_depth_is_that_of_the_place_in_blocks_of_pixels(context: Any, stack: PanelStack) -> None:
+def test_depth_is_that_of_the_place_in_blocks_of_pixels(opened: Any) -> None:
     """The nearest point of a scene that is moved 5 cm nearer is seen 5 cm nearer; blocks keep their nearest pixel."""
-    view = panel_view(EYE, stack.panel(1))
-    settings = ContentSettings(scene="demo")
+    view = panel_view(EYE, STACK.panel(1))
     nearest_m = []
     for offset_m in (0.0, 0.05):
-        with_offset = settings.model_copy(update={"offset_m": (offset_m, 0.0, 0.0)})
-        content = open_content(with_offset, stack, context)
+        content = opened("demo", offset_m=(offset_m, 0.0, 0.0))
         content.render(view, time_ns=0)
         fine = content.nearness(view, every=1, first=(0, 0))
         coarse = content.nearness(view, every=4, first=(3, 1))
@@ -125,5 +114,4 @@ def test_depth_is_that_of_the_place_in_blocks_of_pixels(context: Any, stack: Pan
         padded[1:, 3:][: fine.shape[0], : fine.shape[1]] = fine
         np.testing.assert_allclose(coarse, padded.reshape(coarse.shape[0], 4, -1, 4).max((1, 3)), rtol=1e-5)
         nearest_m.append(1 / fine.max())
-        content.close()
     assert nearest_m[0] - nearest_m[1] == pytest.approx(0.05, abs=1e-3)

@@ -12,11 +12,9 @@ from runtime.clock import NS_PER_S
 from runtime.config import ContentSettings
 from runtime.content.base import ContentInfo, ContentSource, View
 from runtime.content.playlist import PlaylistSource, read_playlist
-from runtime.optics.stack import PanelStack
 from runtime.support.artifacts import write_png
 from tests.calls import refusal
-from tests.content.conftest import panel_view
-from tests.content.test_pictures import opened
+from tests.content.conftest import STACK, panel_view
 
 EYE = (0.6, 0.0, 0.0)
 COLOURS = {"red.png": (255, 0, 0), "green.png": (0, 255, 0), "blue.png": (0, 0, 255)}
@@ -35,50 +33,51 @@ def written(folder: Path, *shows: str, head: str = "") -> Path:
     return path
 
 
-def colour_at(source: ContentSource, stack: PanelStack, time_s: float) -> str:
-    picture = source.render(panel_view(EYE, stack.panel(1)), time_ns=round(time_s * NS_PER_S))
-    pixel = tuple(picture[stack.height_px // 2, stack.width_px // 2, :3].tolist())
+def colour_at(source: ContentSource, time_s: float) -> str:
+    picture = source.render(panel_view(EYE, STACK.panel(1)), time_ns=round(time_s * NS_PER_S))
+    pixel = tuple(picture[STACK.height_px // 2, STACK.width_px // 2, :3].tolist())
     return next((name.removesuffix(".png") for name, colour in COLOURS.items() if colour == pixel), str(pixel))
 
 
 THREE = ("scene = 'red.png'\nseconds = 2", "scene = 'green.png'\nseconds = 3", "scene = 'blue.png'\nseconds = 1")
 
 
-def test_each_is_shown_for_its_time_from_when_the_first_was(folder: Path, context: Any, stack: PanelStack) -> None:
-    source = opened(written(folder, *THREE), context, stack)
+def test_each_is_shown_for_its_time_from_when_the_first_was(folder: Path, opened: Any) -> None:
+    source = opened(written(folder, *THREE))
     start = 1000.0
     times = (0, 1.9, 2.1, 4.9, 5.1, 5.9, 6.1, 8.5)
-    shown = [colour_at(source, stack, start + time) for time in times]
+    shown = [colour_at(source, start + time) for time in times]
     assert shown == ["red", "red", "green", "green", "blue", "blue", "red", "green"]
     assert source.info.name == "list: green (2 of 3)"
     told = source.describe(time_ns=round((start + 8.5) * NS_PER_S))
     assert told is not None and (told["index"], told["left_s"]) == (1, 2.5)
     assert [entry["seconds"] for entry in told["entries"]] == [2, 3, 1]
-    source.close()
 
 
-def test_one_that_does_not_repeat_stays_at_its_last(folder: Path, context: Any, stack: PanelStack) -> None:
-    source = opened(written(folder, *THREE, head="repeat = false\n"), context, stack)
-    assert [colour_at(source, stack, time) for time in (0, 5.5, 100)] == ["red", "blue", "blue"]
+def test_one_that_does_not_repeat_stays_at_its_last(folder: Path, opened: Any) -> None:
+    source = opened(written(folder, *THREE, head="repeat = false\n"))
+    assert [colour_at(source, time) for time in (0, 5.5, 100)] == ["red", "blue", "blue"]
+    left_s = [source.describe(time_ns=round(time_s * NS_PER_S))["left_s"] for time_s in (1.5, 4.0, 5.5, 99.0)]
+    assert left_s == [0.5, 1.0, None, None]
     assert not source.skip(time_ns=101 * NS_PER_S)
 
 
-def test_the_next_one_can_be_asked_for(folder: Path, context: Any, stack: PanelStack) -> None:
-    source = opened(written(folder, *THREE), context, stack)
-    assert colour_at(source, stack, 50.0) == "red"
+def test_the_next_one_can_be_asked_for(folder: Path, opened: Any) -> None:
+    source = opened(written(folder, *THREE))
+    assert colour_at(source, 50.0) == "red"
     assert source.skip(time_ns=round(50.5 * NS_PER_S))
-    assert colour_at(source, stack, 50.6) == "green"
-    assert colour_at(source, stack, 53.4) == "green" and colour_at(source, stack, 53.6) == "blue"
+    assert colour_at(source, 50.6) == "green"
+    assert colour_at(source, 53.4) == "green" and colour_at(source, 53.6) == "blue"
 
 
-def test_an_entry_has_its_own_settings_and_place(folder: Path, context: Any, stack: PanelStack) -> None:
+def test_an_entry_has_its_own_settings_and_place(folder: Path, opened: Any) -> None:
     shows = ("scene = 'red.png'\nseconds = 1\nscale = 0.5", "scene = 'sparse'\nseconds = 1\nturntable_per_min = 6")
-    source = opened(written(folder, *shows), context, stack, offset_m=(0.0, 0.05, 0.0))
-    picture = source.render(panel_view(EYE, stack.panel(1)), time_ns=0)
+    source = opened(written(folder, *shows), offset_m=(0.0, 0.05, 0.0))
+    picture = source.render(panel_view(EYE, STACK.panel(1)), time_ns=0)
     columns = np.nonzero(picture[..., 3] > 127)[1]
-    pitch_m = stack.width_m / stack.width_px
-    assert columns.mean() + 0.5 - stack.width_px / 2 == pytest.approx(0.05 / pitch_m, abs=1)
-    assert np.ptp(columns) + 1 == pytest.approx(stack.width_px / 2, rel=0.03)
+    pitch_m = STACK.width_m / STACK.width_px
+    assert columns.mean() + 0.5 - STACK.width_px / 2 == pytest.approx(0.05 / pitch_m, abs=1)
+    assert np.ptp(columns) + 1 == pytest.approx(STACK.width_px / 2, rel=0.03)
 
 
 @pytest.mark.parametrize(
@@ -97,18 +96,18 @@ def test_an_entry_has_its_own_settings_and_place(folder: Path, context: Any, sta
     ],
 )
 def test_a_list_that_is_wrong_is_one_line_that_names_its_entry(
-    folder: Path, context: Any, stack: PanelStack, shows: tuple[str, ...], told: str
+    folder: Path, opened: Any, shows: tuple[str, ...], told: str
 ) -> None:
     path = written(folder, *shows)
-    assert refusal(opened, path, context, stack).startswith(f"{path}: {told}")
+    assert refusal(opened, path).startswith(f"{path}: {told}")
 
 
 class Inner(ContentSource):
     """Scene that keeps the times it was asked for."""
 
-    def __init__(self, stack: PanelStack, name: str) -> None:
+    def __init__(self, name: str) -> None:
         self.info, self.closed = ContentInfo(name, moving=False, background=None), 0
-        self.picture = np.zeros((stack.height_px, stack.width_px, 4), np.uint8)
+        self.picture = np.zeros((STACK.height_px, STACK.width_px, 4), np.uint8)
         self.asked_ns: list[int] = []
 
     def render(self, view: View, *, time_ns: int) -> np.ndarray:
@@ -120,18 +119,16 @@ class Inner(ContentSource):
 
 
 @pytest.fixture
-def inner(folder: Path, stack: PanelStack) -> tuple[PlaylistSource, list[Inner]]:
-    scenes = [Inner(stack, name) for name in ("red", "green", "blue")]
+def inner(folder: Path) -> tuple[PlaylistSource, list[Inner]]:
+    scenes = [Inner(name) for name in ("red", "green", "blue")]
     playlist = read_playlist(written(folder, *THREE), ContentSettings())
     return PlaylistSource(playlist, [lambda context, s=s: s for s in scenes], context=None), scenes
 
 
-def test_each_scene_has_a_time_that_begins_when_it_is_shown(
-    inner: tuple[PlaylistSource, list[Inner]], stack: PanelStack
-) -> None:
+def test_each_scene_has_a_time_that_begins_when_it_is_shown(inner: tuple[PlaylistSource, list[Inner]]) -> None:
     source, scenes = inner
     for time_s in (100.0, 101.5, 102.0, 104.5, 106.0, 110.25):
-        source.render(panel_view(EYE, stack.panel(1)), time_ns=round(time_s * NS_PER_S))
+        source.render(panel_view(EYE, STACK.panel(1)), time_ns=round(time_s * NS_PER_S))
     shown_s = [[ns / NS_PER_S for ns in scene.asked_ns] for scene in scenes]
     assert shown_s == [[0.0, 1.5, 0.0], [0.0, 2.5, 2.25], []]
 
@@ -152,13 +149,6 @@ def test_no_revision_comes_back_when_a_later_round_is_skipped_through(
         assert source.skip(time_ns=time_ns)
         seen.append(source.revision(time_ns=time_ns))
     assert seen == sorted(set(seen))
-
-
-def test_the_last_entry_without_repetition_has_no_end(folder: Path, context: Any, stack: PanelStack) -> None:
-    source = opened(written(folder, *THREE, head="repeat = false\n"), context, stack)
-    assert colour_at(source, stack, 10.0) == "red"
-    left_s = [source.describe(time_ns=round(time_s * NS_PER_S))["left_s"] for time_s in (11.5, 14.0, 15.5, 99.0)]
-    assert left_s == [0.5, 1.0, None, None]
 
 
 def test_files_of_an_entry_are_next_to_the_list(folder: Path) -> None:

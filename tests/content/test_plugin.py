@@ -16,8 +16,8 @@ from PIL import Image
 
 from runtime.config import ContentSettings, load_settings
 from runtime.content.registry import open_content
-from runtime.optics.stack import PanelStack
 from tests.calls import refusal
+from tests.content.conftest import STACK
 
 ROOT = Path(__file__).resolve().parents[2]
 RUN = "run --config own.toml --replay demo --headless --max-speed --frames 4 --scale 0.1 --out out --json"
@@ -54,7 +54,7 @@ def test_the_example_is_shown_from_a_folder_of_its_own(tmp_path: Path) -> None:
     ],
 )
 def test_a_wrong_one_is_one_line(
-    tmp_path: Path, context: Any, stack: PanelStack, monkeypatch: pytest.MonkeyPatch, code: str, content: str, told: str
+    tmp_path: Path, context: Any, monkeypatch: pytest.MonkeyPatch, code: str, content: str, told: str
 ) -> None:
     shutil.copy(ROOT / "examples" / "tunnel.py", tmp_path)
     text = "from phasestack import ContentSource\n\n\nclass Own(ContentSource):\n"
@@ -65,14 +65,14 @@ def test_a_wrong_one_is_one_line(
     for name in ("own", "tunnel"):
         monkeypatch.delitem(sys.modules, name, raising=False)
     settings = load_settings(tmp_path / "own.toml").content
-    assert told.replace("{folder}", str(tmp_path)) in refusal(open_content, settings, stack, context)
+    assert told.replace("{folder}", str(tmp_path)) in refusal(open_content, settings, STACK, context)
 
 
 def test_a_render_that_takes_other_arguments_is_named(
-    tmp_path: Path, context: Any, stack: PanelStack, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, context: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = "from phasestack import ContentSource\n\n\nclass Eye(ContentSource):\n    def render(self, eye, view): ...\n"
     (tmp_path / "other_render.py").write_text(text)
     monkeypatch.syspath_prepend(str(tmp_path))
-    told = refusal(open_content, ContentSettings(scene="other_render:Eye"), stack, context)
+    told = refusal(open_content, ContentSettings(scene="other_render:Eye"), STACK, context)
     assert "other_render:Eye: render: must be declared as render(self, view, *, time_ns): " in told

@@ -15,7 +15,7 @@ from runtime.content.procedural import ProceduralSource
 from runtime.content.scenes import SCENES, Scene, Thing
 from runtime.content.triangles import DrawnPart, _Look
 from runtime.optics.stack import PanelStack
-from tests.content.conftest import image_view, panel_view
+from tests.content.conftest import STACK, image_view, panel_view
 
 EYES = {
     "ahead": (0.7, -0.03, 0.1),
@@ -40,13 +40,13 @@ def centroid_px(picture: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("eye", EYES.values(), ids=EYES.keys())
 @pytest.mark.parametrize("point", POINTS)
 def test_a_point_lands_where_the_projection_says(
-    context: Any, stack: PanelStack, eye: tuple[float, ...], point: tuple[float, float, float]
+    context: Any, eye: tuple[float, ...], point: tuple[float, float, float]
 ) -> None:
-    source = ProceduralSource(Scene("bead", (bead(point),)), stack=stack, context=context)
+    source = ProceduralSource(Scene("bead", (bead(point),)), stack=STACK, context=context)
     seen = 0
     for view in (
-        panel_view(eye, stack.panel(1)),
-        panel_view(eye, stack.panel(0)),
+        panel_view(eye, STACK.panel(1)),
+        panel_view(eye, STACK.panel(0)),
         image_view(eye, 640, 360, fov_deg=60),
     ):
         expected = project(view.pixels_from_stack, np.array([point]))[0][0]
@@ -61,32 +61,32 @@ def test_a_point_lands_where_the_projection_says(
 
 
 @pytest.mark.parametrize("make", [panel_view, image_view], ids=["raster", "image"])
-def test_the_nearer_of_two_surfaces_hides_the_other(context: Any, stack: PanelStack, make: Any) -> None:
+def test_the_nearer_of_two_surfaces_hides_the_other(context: Any, make: Any) -> None:
     eye = np.array([0.6, 0.1, 0.05])
     front, rear = eye * 0.1, eye * -0.1
     red, blue = bead(tuple(front), (1.0, 0.0, 0.0)), bead(tuple(rear), (0.0, 0.0, 1.0))
-    view = panel_view(eye, stack.panel(1)) if make is panel_view else image_view(eye, 480, 270)
+    view = panel_view(eye, STACK.panel(1)) if make is panel_view else image_view(eye, 480, 270)
     for parts in ((red, blue), (blue, red)):
-        source = ProceduralSource(Scene("two", parts), stack=stack, context=context)
+        source = ProceduralSource(Scene("two", parts), stack=STACK, context=context)
         picture = source.render(view, time_ns=0)
         u, v = (int(value) for value in project(view.pixels_from_stack, front[None])[0][0])
         assert picture[v, u].tolist() == [255, 0, 0, 255]
         source.close()
 
 
-def test_the_same_view_and_time_give_the_same_bytes_in_any_context(context: Any, stack: PanelStack) -> None:
+def test_the_same_view_and_time_give_the_same_bytes_in_any_context(context: Any) -> None:
     from runtime.support.gl import offscreen_context
 
-    view = panel_view(EYES["ahead"], stack.panel(1))
-    first = ProceduralSource("demo", stack=stack, context=context).render(view, time_ns=0).copy()
+    view = panel_view(EYES["ahead"], STACK.panel(1))
+    first = ProceduralSource("demo", stack=STACK, context=context).render(view, time_ns=0).copy()
     with offscreen_context() as other:
-        second = ProceduralSource("demo", stack=stack, context=other).render(view, time_ns=10**10).copy()
+        second = ProceduralSource("demo", stack=STACK, context=other).render(view, time_ns=10**10).copy()
     assert first.tobytes() == second.tobytes()
 
 
-def test_alpha_is_zero_exactly_where_only_the_background_shows(context: Any, stack: PanelStack) -> None:
-    source = ProceduralSource("sparse", stack=stack, context=context, background=(1.0, 0.5, 0.0))
-    picture = source.render(panel_view(EYES["ahead"], stack.panel(1)), time_ns=0)
+def test_alpha_is_zero_exactly_where_only_the_background_shows(context: Any) -> None:
+    source = ProceduralSource("sparse", stack=STACK, context=context, background=(1.0, 0.5, 0.0))
+    picture = source.render(panel_view(EYES["ahead"], STACK.panel(1)), time_ns=0)
     empty = picture[..., 3] == 0
     assert 0.9 < empty.mean() < 0.99
     assert (picture[empty][:, :3] == [255, 128, 0]).all()
@@ -94,9 +94,9 @@ def test_alpha_is_zero_exactly_where_only_the_background_shows(context: Any, sta
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_every_scene_is_what_it_says_of_itself(context: Any, stack: PanelStack, name: str) -> None:
-    source = ProceduralSource(name, stack=stack, context=context)
-    view = panel_view(EYES["ahead"], stack.panel(1))
+def test_every_scene_is_what_it_says_of_itself(context: Any, name: str) -> None:
+    source = ProceduralSource(name, stack=STACK, context=context)
+    view = panel_view(EYES["ahead"], STACK.panel(1))
     picture = source.render(view, time_ns=0).copy()
     later = source.render(view, time_ns=10**9)
     assert source.info.moving == bool((picture != later).any())
@@ -107,17 +107,15 @@ def test_every_scene_is_what_it_says_of_itself(context: Any, stack: PanelStack, 
 
 
 @pytest.mark.parametrize("eye", [EYES["ahead"], EYES["near"]])
-def test_outlines_are_smooth_and_grow_by_less_than_a_pixel(
-    context: Any, stack: PanelStack, eye: tuple[float, ...]
-) -> None:
-    fine = PanelStack(stack.width_m, stack.height_m, stack.x_m, stack.width_px * 4, stack.height_px * 4)
-    one_sample = ProceduralSource("demo", stack=stack, context=context)
+def test_outlines_are_smooth_and_grow_by_less_than_a_pixel(context: Any, eye: tuple[float, ...]) -> None:
+    fine = PanelStack(STACK.width_m, STACK.height_m, STACK.x_m, STACK.width_px * 4, STACK.height_px * 4)
+    one_sample = ProceduralSource("demo", stack=STACK, context=context)
     one_sample._ramps = None
     exact = one_sample.render(panel_view(eye, fine.panel(1)), time_ns=0)
-    wanted = cv2.resize(exact, (stack.width_px, stack.height_px), interpolation=cv2.INTER_AREA)[..., 3].astype(float)
-    hard = one_sample.render(panel_view(eye, stack.panel(1)), time_ns=0)[..., 3].astype(float)
-    source = ProceduralSource("demo", stack=stack, context=context)
-    smooth = source.render(panel_view(eye, stack.panel(1)), time_ns=0)[..., 3].astype(float)
+    wanted = cv2.resize(exact, (STACK.width_px, STACK.height_px), interpolation=cv2.INTER_AREA)[..., 3].astype(float)
+    hard = one_sample.render(panel_view(eye, STACK.panel(1)), time_ns=0)[..., 3].astype(float)
+    source = ProceduralSource("demo", stack=STACK, context=context)
+    smooth = source.render(panel_view(eye, STACK.panel(1)), time_ns=0)[..., 3].astype(float)
     # A staircase is where coverage jumps from nothing to all between two rows.
     assert (np.abs(np.diff(smooth, axis=0)) == 255).mean() < 0.5 * (np.abs(np.diff(hard, axis=0)) == 255).mean()
     outline_px = ((wanted > 0) & (wanted < 255)).sum()
@@ -126,11 +124,11 @@ def test_outlines_are_smooth_and_grow_by_less_than_a_pixel(
 
 @pytest.mark.parametrize("eye", EYES.values(), ids=EYES.keys())
 def test_leaving_out_the_back_faces_of_solid_things_changes_no_picture(
-    context: Any, stack: PanelStack, monkeypatch: pytest.MonkeyPatch, eye: tuple[float, ...]
+    context: Any, monkeypatch: pytest.MonkeyPatch, eye: tuple[float, ...]
 ) -> None:
-    source = ProceduralSource("demo", stack=stack, context=context)
+    source = ProceduralSource("demo", stack=STACK, context=context)
     source._with_ramps = False
-    view = panel_view(eye, stack.panel(1))
+    view = panel_view(eye, STACK.panel(1))
     culled = source.render(view, time_ns=0).astype(int)
     assert sum(part.front_faces(_look(source, view, n)) is not None for n, part in enumerate(source.parts)) == 6
     monkeypatch.setattr(DrawnPart, "front_faces", lambda *_: None)
@@ -138,10 +136,10 @@ def test_leaving_out_the_back_faces_of_solid_things_changes_no_picture(
     assert (np.abs(culled - drawn).max(axis=2) > 2).sum() <= 10  # back faces may show through at an outline's pixels
 
 
-def test_an_eye_in_a_solid_thing_sees_its_inside(context: Any, stack: PanelStack) -> None:
+def test_an_eye_in_a_solid_thing_sees_its_inside(context: Any) -> None:
     around = Thing(shapes.box((2.0, 2.0, 2.0)), "plain", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), lit=False)
-    source = ProceduralSource(Scene("inside", (around,)), stack=stack, context=context)
-    assert (source.render(panel_view(EYES["ahead"], stack.panel(1)), time_ns=0) == [255, 0, 0, 255]).all()
+    source = ProceduralSource(Scene("inside", (around,)), stack=STACK, context=context)
+    assert (source.render(panel_view(EYES["ahead"], STACK.panel(1)), time_ns=0) == [255, 0, 0, 255]).all()
 
 
 def _look(source: ProceduralSource, view: View, part: int) -> _Look:

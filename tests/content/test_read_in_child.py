@@ -22,9 +22,8 @@ from runtime.content import registry
 from runtime.content.mesh import load_mesh
 from runtime.content.placing import SceneFile
 from runtime.content.registry import prepare_content
-from runtime.optics.stack import PanelStack
 from runtime.support.artifacts import write_png
-from tests.content.conftest import panel_view
+from tests.content.conftest import STACK, panel_view
 from tests.content.picture_files import lif, make_video
 from tests.content.test_eyereal import write_pair
 from tests.content.test_pictures import rgbd_picture, solid
@@ -35,7 +34,7 @@ pytestmark = pytest.mark.child
 MIB = 1 << 20
 
 
-def written_as(kind: str, folder: Path, context: Any, stack: PanelStack) -> Path:
+def written_as(kind: str, folder: Path, context: Any) -> Path:
     path = folder / f"scene.{kind}"
     match kind:
         case "splats":
@@ -48,7 +47,7 @@ def written_as(kind: str, folder: Path, context: Any, stack: PanelStack) -> Path
             return folder
         case "pairs":
             (folder / "lego_bulldozer").mkdir()
-            write_pair(folder / "lego_bulldozer", context, stack)
+            write_pair(folder / "lego_bulldozer", context)
             return folder / "lego_bulldozer"
         case "depth":
             write_png(folder / "a_rgbd.png", rgbd_picture())
@@ -68,18 +67,18 @@ def written_as(kind: str, folder: Path, context: Any, stack: PanelStack) -> Path
     "kind", ["glb", "gltf", "obj", "off", "ply", "stl", "splats", "tif", "leia", "depth", "mp4", "a folder", "pairs"]
 )
 def test_what_was_read_there_is_drawn_as_what_is_read_here(
-    kind: str, tmp_path: Path, context: Any, stack: PanelStack, monkeypatch: pytest.MonkeyPatch
+    kind: str, tmp_path: Path, context: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = written_as(kind, tmp_path, context, stack)
+    path = written_as(kind, tmp_path, context)
     used: list[Any] = []
     real = registry.in_child
     monkeypatch.setattr(registry, "in_child", lambda *given, **how: (used.append(given), real(*given, **how))[1])
     settings = ContentSettings(scene=str(path))
-    there = prepare_content(settings, stack)(context=context)
-    here = registry._read(SceneFile(path, settings, stack))(context=context)
+    there = prepare_content(settings, STACK)(context=context)
+    here = registry._read(SceneFile(path, settings, STACK))(context=context)
     assert len(used) == 1
     for side, y_m in enumerate((-0.03, 0.03)):
-        view = panel_view([0.7, y_m, 0.0], stack.panel(1), side)
+        view = panel_view([0.7, y_m, 0.0], STACK.panel(1), side)
         drawn = there.render(view, time_ns=0).copy()
         assert np.array_equal(drawn, here.render(view, time_ns=0)) and np.ptp(drawn[..., :3]) > 20
     assert there.info == here.info
@@ -87,18 +86,16 @@ def test_what_was_read_there_is_drawn_as_what_is_read_here(
     here.close()
 
 
-def test_a_small_picture_needs_no_process(
-    tmp_path: Path, context: Any, stack: PanelStack, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_small_picture_needs_no_process(tmp_path: Path, context: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(registry, "in_child", None)
     write_png(tmp_path / "a.png", solid((200, 30, 60)))
-    prepare_content(ContentSettings(scene=str(tmp_path / "a.png")), stack)(context=context).close()
+    prepare_content(ContentSettings(scene=str(tmp_path / "a.png")), STACK)(context=context).close()
 
 
-def test_lines_of_its_log_are_ours(tmp_path: Path, stack: PanelStack, caplog: pytest.LogCaptureFixture) -> None:
+def test_lines_of_its_log_are_ours(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / "a.obj").write_text("mtllib gone.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     with caplog.at_level(logging.INFO):
-        prepare_content(ContentSettings(scene=str(tmp_path / "a.obj")), stack)
+        prepare_content(ContentSettings(scene=str(tmp_path / "a.obj")), STACK)
     assert "drawing the mesh in grey without its materials" in caplog.text
 
 

@@ -24,7 +24,7 @@ from runtime.content.splat import SplatSource, prepare
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from tests.calls import refusal
-from tests.content.conftest import image_view, panel_view
+from tests.content.conftest import STACK, image_view, panel_view
 from tests.content.packed_splat_files import write_compressed, write_sog, write_splat, write_spz
 from tests.content.splat_reference import harmonics, render
 
@@ -62,10 +62,10 @@ def loaded(path: Path) -> Gaussians:
     return load_gaussians(read_header(path))
 
 
-def placed(path: Path, context: Any, stack: PanelStack, **settings: Any) -> tuple[SplatSource, np.ndarray]:
+def placed(path: Path, context: Any, **settings: Any) -> tuple[SplatSource, np.ndarray]:
     gaussians = loaded(path)
     low, high = gaussians.centres.min(0).astype(float), gaussians.centres.max(0).astype(float)
-    matrix = SceneFile(path, ContentSettings(**settings), stack).placed(low, high)
+    matrix = SceneFile(path, ContentSettings(**settings), STACK).placed(low, high)
     info = ContentInfo("a", background=(1.0, 0.9, 0.8))
     return SplatSource(gaussians, stack_from_scene=matrix, context=context, info=info), matrix
 
@@ -100,7 +100,7 @@ def test_the_picture_agrees_with_an_exact_renderer_of_the_same_equations(
 ) -> None:
     stack = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 160, 90)
     table = splat_table(degree=degree)
-    source, matrix = placed(written(tmp_path, table), context, stack, depth_m=(-0.1, 0.1))
+    source, matrix = placed(written(tmp_path, table), context, depth_m=(-0.1, 0.1))
     for view in (panel_view(eye, stack.panel(1)), image_view(eye, 160, 90, fov_deg=50)):
         picture = source.render(view, time_ns=0)
         wanted = np.clip(exact(table, matrix, view), 0, 1)
@@ -115,7 +115,7 @@ def test_many_splats_deep_agree_with_the_exact_renderer_for_both_eyes(tmp_path: 
     table = splat_table(2000)
     for axis in range(3):
         table[f"scale_{axis}"] = np.random.default_rng(axis).normal(-3.1, 0.6, 2000)
-    source, matrix = placed(written(tmp_path, table), context, stack, depth_m=(-0.1, 0.1))
+    source, matrix = placed(written(tmp_path, table), context, depth_m=(-0.1, 0.1))
     for side, eye in enumerate(((0.6, -0.03, 0.05), (0.6, 0.03, 0.05))):
         view = panel_view(eye, stack.panel(1), side=side)
         error = source.render(view, time_ns=0)[..., :3] / 255 - np.clip(exact(table, matrix, view), 0, 1)
@@ -173,7 +173,7 @@ def test_a_file_without_a_usable_splat_is_refused(tmp_path: Path) -> None:
         loaded(written(tmp_path, table))
 
 
-def test_nothing_of_a_large_splat_is_cut_off(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+def test_nothing_of_a_large_splat_is_cut_off(tmp_path: Path, context: Any) -> None:
     """Its centre alone says nothing of how far it reaches."""
     table = splat_table(3, degree=0)
     for axis in range(3):
@@ -181,13 +181,13 @@ def test_nothing_of_a_large_splat_is_cut_off(tmp_path: Path, context: Any, stack
         table[f"scale_{axis}"] = np.log(1.0)
     table["opacity"] = 4.0
     path = written(tmp_path, table)
-    source = prepare(SceneFile(path, ContentSettings(), stack))(context=context)
-    covered = source.render(panel_view((0.6, 0.0, 0.0), stack.panel(1)), time_ns=0)[..., 3]
+    source = prepare(SceneFile(path, ContentSettings(), STACK))(context=context)
+    covered = source.render(panel_view((0.6, 0.0, 0.0), STACK.panel(1)), time_ns=0)[..., 3]
     assert covered[135, 240] > 200
     assert max(covered[0].max(), covered[-1].max(), covered[:, 0].max(), covered[:, -1].max()) < 40
 
 
-def test_splats_stand_as_cameras_see_them(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+def test_splats_stand_as_cameras_see_them(tmp_path: Path, context: Any) -> None:
     """Trainers have y down and z away from the camera: a red splat at -y is above."""
     table = splat_table(2, degree=0)
     for name in ("x", "y", "z"):
@@ -197,8 +197,8 @@ def test_splats_stand_as_cameras_see_them(tmp_path: Path, context: Any, stack: P
         table[f"scale_{axis}"] = np.log(0.2)
         table[f"f_dc_{axis}"] = [1.5 if axis == 0 else -1.5, 1.5 if axis == 2 else -1.5]
     table["opacity"] = 4.0
-    source = prepare(SceneFile(written(tmp_path, table), ContentSettings(), stack))(context=context)
-    picture = source.render(panel_view((0.6, 0.0, 0.0), stack.panel(1)), time_ns=0)
+    source = prepare(SceneFile(written(tmp_path, table), ContentSettings(), STACK))(context=context)
+    picture = source.render(panel_view((0.6, 0.0, 0.0), STACK.panel(1)), time_ns=0)
     assert picture[:135, 240, :3].max(0).argmax() == 0 and picture[135:, 240, :3].max(0).argmax() == 2
 
 
@@ -245,12 +245,12 @@ def test_packed_splats_are_those_that_were_packed(tmp_path: Path, form: str) -> 
     assert found.harmonics == pytest.approx(wanted.harmonics, abs=0.02)
 
 
-def test_a_compressed_file_stands_by_its_format_s_custom(tmp_path: Path, stack: PanelStack) -> None:
+def test_a_compressed_file_stands_by_its_format_s_custom(tmp_path: Path) -> None:
     """SPZ has y up, SOG y down as trainers write it."""
     table = splat_table(50, 0)
     ups = []
     for path in (write_spz(tmp_path / "a.spz", table, version=3), write_sog(tmp_path / "a.sog", table)):
-        opener = prepare(SceneFile(path, ContentSettings(scene=str(path)), stack))
+        opener = prepare(SceneFile(path, ContentSettings(scene=str(path)), STACK))
         ups.append(opener.keywords["stack_from_scene"][2, 1])  # type: ignore[attr-defined]
     assert ups[0] > 0 > ups[1]
 
@@ -282,11 +282,11 @@ def test_a_compressed_file_stands_by_its_format_s_custom(tmp_path: Path, stack: 
         ("a.ply", lambda data: data.replace(b"element chunk", b"element chumk"), "chunk: is missing"),
     ],
 )
-def test_a_broken_packed_file_is_one_line(tmp_path: Path, stack: PanelStack, name: str, change: Any, told: str) -> None:
+def test_a_broken_packed_file_is_one_line(tmp_path: Path, name: str, change: Any, told: str) -> None:
     write = {".splat": write_splat, ".ply": write_compressed, ".spz": partial(write_spz, version=2), ".sog": write_sog}
     path = write[name[1:]](tmp_path / name, splat_table(600, degree=0))
     path.write_bytes(change(path.read_bytes()))
-    assert refusal(prepare_content, ContentSettings(scene=str(path)), stack).startswith(f"{path}: {told}")
+    assert refusal(prepare_content, ContentSettings(scene=str(path)), STACK).startswith(f"{path}: {told}")
 
 
 def edited(folder: Path, old: bytes, new: bytes, cut: int = 0) -> Path:
@@ -329,21 +329,19 @@ def test_a_broken_file_is_one_line(tmp_path: Path, old: bytes, new: bytes, cut: 
 
 
 def test_splats_drawn_a_few_at_a_time_are_those_drawn_together(
-    tmp_path: Path, context: Any, stack: PanelStack, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, context: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path, pictures = written(tmp_path, splat_table(50)), []
     for at_once in (1000, 7):
         monkeypatch.setattr(splat, "AT_ONCE", at_once)
-        source = prepare_content(ContentSettings(scene=str(path)), stack)(context=context)
-        pictures.append(source.render(panel_view([0.6, 0.03, 0.0], stack.panel(1)), time_ns=0).copy())
+        source = prepare_content(ContentSettings(scene=str(path)), STACK)(context=context)
+        pictures.append(source.render(panel_view([0.6, 0.03, 0.0], STACK.panel(1)), time_ns=0).copy())
         source.close()
     assert np.array_equal(*pictures) and np.ptp(pictures[0][..., :3]) > 20
 
 
-def test_splats_behind_the_eye_or_beside_the_raster_draw_nothing(
-    tmp_path: Path, context: Any, stack: PanelStack
-) -> None:
+def test_splats_behind_the_eye_or_beside_the_raster_draw_nothing(tmp_path: Path, context: Any) -> None:
     table = splat_table(50)
-    source, _ = placed(written(tmp_path, table), context, stack)
-    picture = source.render(panel_view((-1.0, 0.0, 0.0), stack.panel(1)), time_ns=0)
+    source, _ = placed(written(tmp_path, table), context)
+    picture = source.render(panel_view((-1.0, 0.0, 0.0), STACK.panel(1)), time_ns=0)
     assert (picture[..., 3] == 0).all()
