@@ -116,7 +116,7 @@ class PipeFeed(Feed):
         if self._options.rgb_size is not None:
             form, given = "rawvideo", {"pixel_format": "rgb24", "video_size": "{}x{}".format(*self._options.rgb_size)}
         try:
-            with av.open(pipe, format=form, options=given) as container:
+            with av.open(pipe, "r", format=form, options=given) as container:
                 stream = container.streams.video[0]
                 if stream.width * stream.height * 3 > FRAME_MAX_BYTES:
                     raise ValueError(f"pictures of {stream.width} x {stream.height} pixels cannot be shown")
