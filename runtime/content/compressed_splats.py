@@ -1,4 +1,4 @@
-"""Read compressed Gaussian splats: SuperSplat's .ply, .splat, SPZ (versions 1 to 4) and SOG (version 2)."""
+"""Read compressed Gaussian splats: SuperSplat's .ply, .splat, SPZ (version 1 to 4), SOG (version 2)."""
 
 from __future__ import annotations
 
