@@ -29,7 +29,7 @@ def moved_in(name: str, now: Played) -> list[Moved]:
     """Differences from the stored run; everything if none is stored."""
     stored = stored_text(name)
     if stored is None:
-        return [Moved(None, "reference", "none", "a run", None, 0.0)]
+        return [Moved(None, "reference", "none", "a run")]
     found = compare_text(stored, [now.summary, *now.refreshes])
     for number, panels in now.panels.items():
         kept = stored_panels(name, number, count=len(panels))

@@ -152,8 +152,8 @@ def test_a_column_law_inverts_and_without_bend_is_even() -> None:
     assert ColumnLaw().homography_from_column(u) is u
 
 
-def test_the_raster_covers_all_panels_from_the_side_too() -> None:
-    for angle_deg in (-50, -20, 20, 50):
+def test_the_raster_covers_all_panels_from_ahead_and_from_the_side() -> None:
+    for angle_deg in (-50, -20, 0, 20, 50):
         frame = chain_frame(eyes_at(distance_m=0.7, angle_deg=angle_deg), STACK, most_cell_px=4, reduction=2)
         scale, shift = Plane(STACK.x_m[1]).scale_shift_to(Plane(frame.x_m), frame.middle_m)
         raster_from_plane = np.linalg.inv(frame.plane_from_raster)
@@ -165,16 +165,6 @@ def test_the_raster_covers_all_panels_from_the_side_too() -> None:
                 # Beside it is only what no ray through all panels reaches.
                 column = float(column_of(frame.columns, np.array(t / w)))
                 assert -0.2 * frame.width_px < column < 1.2 * frame.width_px
-
-
-def test_the_raster_covers_what_is_seen_of_all_panels() -> None:
-    frame = chain_frame(eyes(0.6), STACK, most_cell_px=4, reduction=2)
-    corners = frame.plane_from_raster @ np.array([[0, frame.width_px], [0, frame.rows], [1, 1]])
-    # The rear panel is the smallest as seen on the plane between.
-    scale, _ = Plane(STACK.x_m[0]).scale_shift_to(Plane(frame.x_m), frame.middle_m)
-    assert corners[0].min() <= -STACK.width_m / 2 * scale
-    assert corners[0].max() >= STACK.width_m / 2 * scale
-    assert corners[1].max() >= STACK.height_m / 2 * scale
 
 
 def test_eyes_above_each_other_have_no_row_to_solve_along() -> None:
@@ -194,7 +184,7 @@ TILTED, UPRIGHT = eyes(0.55, 0.12, 0.09, roll_deg=15), eyes(0.7, -0.1, 0.05)
 
 @pytest.mark.parametrize("pair", [TILTED, UPRIGHT], ids=["tilted", "upright"])
 @pytest.mark.parametrize("x_m", [-0.06, 0.0, 0.06])
-def test_a_pixel_maps_to_where_the_eye_s_ray_crosses_a_panel(pair: np.ndarray, x_m: float) -> None:
+def test_a_pixel_maps_to_where_the_eye_s_ray_crosses_a_panel_and_back(pair: np.ndarray, x_m: float) -> None:
     frame = chain_frame(pair, STACK, most_cell_px=4, reduction=2)
     for pixel in ([0.0, 0.0], [100.0, 30.0], [frame.width_px - 1.0, frame.rows / 2]):
         y_m, z_m, _ = frame.plane_from_raster @ [*pixel, 1.0]
@@ -202,12 +192,6 @@ def test_a_pixel_maps_to_where_the_eye_s_ray_crosses_a_panel(pair: np.ndarray, x
             step = np.array([frame.x_m, y_m, z_m]) - eye_m
             hit = eye_m + step * (x_m - eye_m[0]) / step[0]
             assert (frame.plane_from_frame(eye_m, x_m=x_m) @ [*pixel, 1.0])[:2] == pytest.approx(hit[1:], abs=1e-12)
-
-
-@pytest.mark.parametrize("pair", [TILTED, UPRIGHT], ids=["tilted", "upright"])
-@pytest.mark.parametrize("x_m", [-0.06, 0.0, 0.06])
-def test_back_projection_is_the_inverse_as_seen_between_the_eyes(pair: np.ndarray, x_m: float) -> None:
-    frame = chain_frame(pair, STACK, most_cell_px=4, reduction=2)
     there_and_back = frame.frame_from_plane(x_m=x_m) @ frame.plane_from_frame(frame.middle_m, x_m=x_m)
     np.testing.assert_allclose(there_and_back / there_and_back[2, 2], np.eye(3), atol=1e-9)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import onnx
 import pytest
 
 from runtime.config import ModelSettings
@@ -14,11 +13,11 @@ from runtime.model.contract import METADATA_KEY, parse_contract
 from runtime.model.predictor import SHIPPED, load_predictor, model_path
 from runtime.optics.stack import PanelStack
 from tests.model.scenes import STACK
+from tests.model.test_session import saved, shipped
 
 
 def contract_of(name: str) -> dict[str, object]:
-    model = onnx.load(str(model_path(name)))
-    return json.loads({entry.key: entry.value for entry in model.metadata_props}[METADATA_KEY])
+    return json.loads({entry.key: entry.value for entry in shipped(name).metadata_props}[METADATA_KEY])
 
 
 @pytest.mark.parametrize("name", SHIPPED)
@@ -56,24 +55,13 @@ def test_a_missing_or_malformed_contract_is_refused(text: str | None) -> None:
         parse_contract({} if text is None else {METADATA_KEY: text}, source="m.onnx")
 
 
-def rewritten(tmp_path: Path, change: dict[str, object]) -> Path:
-    model = onnx.load(str(model_path("fast")))
-    for entry in model.metadata_props:
-        if entry.key == METADATA_KEY:
-            entry.value = json.dumps(contract_of("fast") | change)
-    path = tmp_path / "changed.onnx"
-    onnx.save(model, str(path))
-    return path
-
-
 def test_a_model_for_other_panels_is_refused(tmp_path: Path) -> None:
-    path = rewritten(tmp_path, {"panels": 4})
     with pytest.raises(InputError, match="panels"):
-        load_predictor(str(path), STACK)
+        load_predictor(str(saved(shipped(), tmp_path, panels=4)), STACK)
 
 
 def test_a_shipped_network_with_the_inputs_of_another_version_is_refused(tmp_path: Path) -> None:
-    model = onnx.load(str(model_path("fast")))
+    model = shipped()
     old = contract_of("fast")
     for port in (*model.graph.input, *old["inputs"]):  # type: ignore[misc]
         if isinstance(port, dict):
@@ -82,11 +70,7 @@ def test_a_shipped_network_with_the_inputs_of_another_version_is_refused(tmp_pat
             port.name = port.name.replace("cell_waves", "basis")
     for node in model.graph.node:
         node.input[:] = ["basis" if name == "cell_waves" else name for name in node.input]
-    for entry in model.metadata_props:
-        if entry.key == METADATA_KEY:
-            entry.value = json.dumps(old | {"graph_sha256": ""})
-    path = tmp_path / "old.onnx"
-    onnx.save(model, str(path))
+    path = saved(model, tmp_path, **old | {"graph_sha256": ""})
     with pytest.raises(InputError, match=r"contract\.inputs.*export the model again"):
         load_predictor(str(path), STACK)
 
@@ -94,7 +78,7 @@ def test_a_shipped_network_with_the_inputs_of_another_version_is_refused(tmp_pat
 def test_a_named_file_never_quietly_becomes_another_solver(tmp_path: Path) -> None:
     uneven = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.03), 480, 270)
     with pytest.raises(InputError, match="evenly"):
-        load_predictor(str(rewritten(tmp_path, {})), uneven)
+        load_predictor(str(saved(shipped(), tmp_path)), uneven)
 
 
 def test_a_provider_that_is_not_installed_names_its_package() -> None:

@@ -135,13 +135,6 @@ def test_codes_of_any_panels_for_any_number_of_views(stack: str, views: int, gl:
         assert not MORE_STACKS[stack].is_grey(n) or (np.ptp(found[n, ..., :3], axis=-1) == 0).all()
 
 
-@pytest.mark.parametrize("gap_m", [0.01, 0.03, 0.2])
-def test_codes_at_every_gap(gap_m: float, gl: GlBackend) -> None:
-    stack, pair = replace(STACK, x_m=(-gap_m, 0.0, gap_m)), eyes(0.9)
-    wanted, found = (layers_of(p, cards(pair, stack), pair) for p in both("balanced", stack, gl))
-    assert within_one(wanted, found) >= WITHIN_ONE
-
-
 @pytest.mark.parametrize("pose", ["straight", "rolled by 20 degrees", "above each other"])
 def test_codes_on_tilted_panels(pose: str, gl: GlBackend) -> None:
     stack, pair = replace(STACK, tilt=TILT), POSES[pose]

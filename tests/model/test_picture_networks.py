@@ -7,8 +7,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import onnx
 import onnxruntime
 import pytest
 from onnx import TensorProto, helper
@@ -125,16 +123,3 @@ def test_every_command_ends_with_2_and_the_same_line(tmp_path: Path) -> None:
         assert done.returncode == 2
         lines.append(done.stderr.strip().splitlines()[-1].partition(", but must be")[0])
     assert set(lines) == {f"phasestack: {path}: outputs.panels: is N x 6 x H x W"}
-
-
-def test_weights_in_another_file_are_refused_with_the_way_to_save_one(tmp_path: Path) -> None:
-    path = network(tmp_path / "a.onnx", IN, OUT)
-    model = onnx.load(path)
-    weights = onnx.numpy_helper.from_array(np.zeros(2000, np.float32), "more")
-    model.graph.initializer.append(weights)
-    onnx.save(model, path, save_as_external_data=True, location="a.data", size_threshold=100)
-    for read in (loaded, validate_file):
-        with pytest.raises(InputError, match=r"external_data: is not supported.*onnx\.save\(onnx\.load\(NAME\)"):
-            read(path)
-    onnx.save(onnx.load(path), tmp_path / "one.onnx")
-    loaded(tmp_path / "one.onnx")

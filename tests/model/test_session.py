@@ -49,7 +49,7 @@ def test_weights_in_another_file_are_refused_wherever_they_are_asked_for(tmp_pat
     model = shipped()
     assert not has_external_data(model.SerializeToString())
     model.graph.initializer.append(outside("elsewhere"))
-    with pytest.raises(InputError, match="external_data: is not supported"):
+    with pytest.raises(InputError, match=r"external_data: is not supported.*onnx\.save\(onnx\.load\(NAME\)"):
         ModelSession(saved(model, tmp_path))
     branch = helper.make_graph([helper.make_node("Constant", [], ["y"], value=outside("deep"))], "b", [], [])
     nested = helper.make_graph(
