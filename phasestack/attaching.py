@@ -1,4 +1,4 @@
-"""Show what a VTK or PyVista application draws, in 3D for the viewer's eyes."""
+"""Show a VTK or PyVista application in 3D for the viewer's eyes."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class Attachment:
 
     @property
     def problem(self) -> str:
-        """Why nothing is shown, in one line; empty if the display asks for pictures."""
+        """Reason for a missing picture, in one line; empty if the display asks for pictures."""
         return self._client.problem
 
     def serve(self, seconds: float) -> None:

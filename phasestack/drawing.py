@@ -1,4 +1,4 @@
-"""Client for the scene `program`. It takes requests and sends what the application draws.
+"""Client for the scene `program`. It takes requests and sends the application's pictures.
 
 docs/programs.md describes the protocol. A separate thread serves the connection. Drawing stays on the caller's thread.
 """

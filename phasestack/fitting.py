@@ -21,7 +21,7 @@ class AppCamera:
     position: F64  # (3,)
     focus: F64  # (3,)
     up: F64  # (3,), not parallel to the direction of sight
-    height: float  # height of what is in view at the focal point
+    height: float  # height of the view at the focal point
     aspect: float  # width of the window, divided by its height
 
 
@@ -63,7 +63,7 @@ def stack_from_scene(
     camera: AppCamera, bounds: F64 | None, eyes_m: Eyes, display_m: tuple[float, float], comfort_deg: float
 ) -> F64:
     """Return the affine map (4, 4) from the application's scene, between corners `bounds` (2, 3), to
-    frame `stack`. The focal point is at the display's centre, and what is in view there fills the display (width,
+    frame `stack`. The focal point is at the display's centre, and the view there fills the display (width,
     height). A scene that would be deeper than `comfort_deg` of vergence for (n, 3) eyes is flattened.
     """
     axes, scale = axes_of(camera), display_m[1] / camera.height

@@ -71,7 +71,7 @@ class _Pair:
     is_resampled: bool  # True if the caller gave cameras
 
     def judged(self, layers: U8) -> SolvedPair:
-        """Combine layers with this request, to compute what each eye sees of them and how good it is."""
+        """Combine layers with this request, to compute each eye's view of them and its quality."""
         return SolvedPair(layers, self.pictures, self.stack, self.eyes_m, self.fov_deg)
 
 
@@ -85,12 +85,12 @@ class Measuring(TypedDict, total=False):
 class Solving(TypedDict, total=False):
     """Further options of `solve`."""
 
-    steps: int | None  # number of steps of a solution; None: as many as the model was made for
+    steps: int | None  # number of steps of a solution; None: the model's own
     floats: bool  # True: keep the layers also as they are before rounding (`Result.floats`)
 
 
 class Result:
-    """The layers computed for pictures, one for each eye. The result can also show what each eye sees of
+    """The layers computed for pictures, one for each eye. The result can also show each eye's view of
     the layers, measure the quality, and save everything to files.
     """
 
@@ -113,7 +113,7 @@ class Result:
 
     @property
     def quality(self) -> PairQuality:
-        """Quality of what the eyes see, measured on first access, which may take longer than solving. A
+        """Quality of the eyes' views, measured on first access, which may take longer than solving. A
         warning is issued for each known reason of ghosts.
         """
         self._warn()

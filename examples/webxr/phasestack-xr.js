@@ -5,14 +5,14 @@
 // @grant       none
 // ==/UserScript==
 
-// Answers `navigator.xr` for pages made for headsets or for `inline-stereo`, and sends what they draw to the scene
+// Answers `navigator.xr` for pages made for headsets or for `inline-stereo`, and sends their pictures to the scene
 // `program` (docs/programs.md). Include it before all other scripts of a page, or install it as a user script.
 (() => {
   "use strict";
   const NATIVE = navigator.xr, NativeLayer = window.XRWebGLLayer;
   const FLOOR_M = 1.6; // height of the eyes above the floor
   const IPD_M = 0.063; // distance between the eyes, if only one is known
-  const HEADSET_M = 2; // distance in the page that stands at the display, for `immersive-vr`
+  const HEADSET_M = 2; // distance in the page that is shown at the display, for `immersive-vr`
   const FIRST_S = 10; // time limit for the display's first request
   const STALE_MS = 500; // frames are drawn at this interval if the display asks for none
   const ENCODING_MAX = 2; // largest number of frames that are being encoded
@@ -20,7 +20,7 @@
   const UNSENT_MAX = 4e6; // largest number of bytes that wait to be sent
 
   // Settings, in order of precedence: the page's address (#phasestack=ws://...&comfort=1), `data-` attributes of this
-  // script's element, and what was entered before. They can be changed while a session runs.
+  // script's element, and earlier entries. They can be changed while a session runs.
   const given = { ...document.currentScript?.dataset }, hash = new URLSearchParams(location.hash.slice(1));
   if (hash.has("phasestack")) {
     Object.assign(given, Object.fromEntries(hash), { address: hash.get("phasestack") });
@@ -32,10 +32,10 @@
   const settings = {
     address: given.address ?? stored() ?? "",
     comfort_deg: Number(given.comfort ?? 1), // largest difference in vergence between far content and the display
-    distance_m: Number(given.distance ?? 0), // distance in the page that stands at the display; 0: 2 m, or 1:1 if inline
+    distance_m: Number(given.distance ?? 0), // distance in the page that is shown at the display; 0: 2 m, or 1:1 if inline
     scale: Number(given.scale ?? 1), // of the pictures, 0.1 to 1
     quality: Number(given.quality ?? 0.95), // of JPEG
-    problem: "", // why nothing is shown
+    problem: "", // reason for a missing picture
     frames: 0, // drawn so far
   };
   if (settings.address) stored(settings.address);
@@ -157,7 +157,7 @@
     return new Transform({ x: m.m41, y: m.m42, z: m.m43, w: 1 }, q);
   }
 
-  // What pages see.
+  // The interface for pages.
 
   class Target extends EventTarget {
     tell(type, more = {}) {

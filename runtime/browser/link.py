@@ -119,7 +119,7 @@ class BrowserLink:
         self.wishes = {**self.wishes, name: value}
 
     def begin_again(self, mode: PageMode) -> None:
-        """Forget all wishes and what was shown, because the refresh loop begins again."""
+        """Forget all wishes and shown pictures, because the refresh loop begins again."""
         self.wishes, self.found, self.shown = {}, None, Shown(told=self.shown.told)
         self.mode = mode
 

@@ -39,7 +39,7 @@ class Row:
 
     name: str
     state: Verdict
-    detail: str  # what was found
+    detail: str  # the finding
     remedy: str = ""  # a remedy for the user; or empty
 
 

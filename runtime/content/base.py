@@ -49,7 +49,7 @@ class ContentInfo:
     background: Colour | None = WHITE  # uniform colour behind the scene, or None if the background is not uniform
     flat_x_m: float | None = None  # x coordinate of the plane that contains the whole scene, or None if not flat
     left_out: tuple[str, ...] = ()  # features in the file that are not drawn
-    fixed_views: bool = False  # True if only two views exist, such as a stereo pair's, wherever the eyes are
+    fixed_views: bool = False  # True if only two views exist, such as a stereo pair's, for all eye positions
 
 
 class ContentSource(ABC):

@@ -181,7 +181,7 @@ def _counted(text: str) -> str:
 
 
 def _from_start(number: str, count: int) -> str:
-    """Number a vertex from the first instead of back from the last of `count`; what is no number stays."""
+    """Number a vertex from the first instead of back from the last of `count`; anything else stays."""
     return str(count + 1 + int(number)) if BACKWARDS.fullmatch(number) else number
 
 

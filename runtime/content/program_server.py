@@ -52,7 +52,7 @@ library_log.setLevel(logging.CRITICAL)
 HOST = "127.0.0.1"
 GIVEN_UP_S = 2.0  # an unanswered frame is abandoned after this time
 HELLO_S = 5.0  # time limit for the handshake, and for a program's greeting
-CLOSED_WITHIN_S = 1.0  # time limit for a program to close its connection, after it was told why
+CLOSED_WITHIN_S = 1.0  # time limit for a program to close its connection, after the close message
 HALF_OPEN_MAX = 16  # largest number of connections without a handshake; the oldest is closed
 CONNECTIONS_MAX = 32  # largest number of connected programs
 QUEUED_MAX = 4  # largest number of messages that the library holds for each connection
@@ -175,7 +175,7 @@ class _Client:
         self.post(_message(number, asked, frame.form.width_px, frame.form.height_px, eyes))
 
     def _has_memory(self, picture_bytes: int) -> bool:
-        """Ensure that there is enough shared memory, and tell the program if it is new."""
+        """Ensure that there is enough shared memory, and send its path to the program if it is new."""
         if self._memory is None or self._memory.picture_bytes < picture_bytes:
             self.close()
             try:

@@ -1,6 +1,6 @@
 """Draw a picture with depth (colour and a grey depth map, side by side) as two surfaces.
 
-The front surface shows the picture and is split wherever the depth jumps, where the foreground would be stretched. The
+The front surface shows the picture and is split where the depth jumps, where the foreground would be stretched. The
 second one fills the hole that a viewer would see when looking past such an edge with a background invented from the
 depths and colours next to the edge. Everywhere, colours are (h, w, 3), and depths (h, w) from 0 (rear) to 1 (front).
 """

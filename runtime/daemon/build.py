@@ -95,7 +95,7 @@ class Run:
         return [asdict(item) for item in plan.items]
 
     def processes(self) -> list[dict[str, Any]]:
-        """Return what each of the run's processes uses, read now."""
+        """Return the current use of memory and processor time by each of the run's processes."""
         own = {"role": "presenter", "restarts": 0, **usage(os.getpid())}
         programs = [] if self.programs is None else self.programs.status()
         return [own, *self.presenter.solver.status(), *self.presenter.samples.status(), *programs]

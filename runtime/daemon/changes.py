@@ -36,7 +36,7 @@ NEEDS_RESTART = (
     "calibration.ipd_m",
 )  # settings read only when a run starts
 
-# What a refusal begins with although the command itself says it.
+# Beginnings of refusals that only repeat the command.
 OWN_PREFIX = {"scene": "content: scene: ", "model": "model: name: ", "place": "place: "}
 
 
@@ -96,7 +96,7 @@ class _Loading:
     order: int | None = None  # number of the order to the solver; None: not sent yet
     begun_s: float = 0.0
     superseded: bool = False  # True if the command has already been answered
-    progress: str = ""  # what is being loaded, for the status
+    progress: str = ""  # content or model being loaded, for the status
 
     def read(self, before: Choices) -> tuple[Choices, Settings, Calibration]:
         """Apply the change to the previous choices, and read what belongs to it. Raises InputError."""
@@ -121,7 +121,7 @@ class Changes:
 
     @property
     def loading(self) -> str | None:
-        """Description of what is being loaded, or None."""
+        """Description of the content or model being loaded, or None."""
         return None if self._loading is None else self._loading.progress
 
     def carry_on(self) -> None:
@@ -168,7 +168,7 @@ class Changes:
             self.choices = self.choices.choosing("content", **values)
 
         loading = self._loading
-        if loading is not None and loading.order is None:  # the solver would undo it with what is still being read
+        if loading is not None and loading.order is None:  # the solver would undo it with the content still being read
             loading.moved |= values
         self._order(command, Move(values), moved)
 

@@ -20,7 +20,7 @@ DEFAULT_SOCKET = "/run/phasestack/status.sock"
 UNIT = "phasestack"
 REQUEST_MAX_BYTES = 65536  # maximum length of a request, which limits how much memory a client can use up
 REQUEST_S = 5.0  # time limit for receiving a request and for sending the answer
-# How long the answer to each request is cached, in seconds.
+# Seconds for which the answer to each request is cached.
 LOOKED_UP_AGAIN_S = {"status": 0.2, "pictures": 0.3, "log": 0.5, "about": 2.0}
 LOOKED_UP_WITHIN_S = 3.0  # time limit for answers not given by the loop; after that, the page reports a hang
 LOADED_WITHIN_S = 60.0  # after this time, a command is answered even if its scene or model is still loading

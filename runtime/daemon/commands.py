@@ -28,11 +28,11 @@ class Command:
         return self.answer.set_running_or_notify_cancel()
 
     def done(self, **state: Any) -> None:
-        """Tell the client that the command succeeded, and give the new state."""
+        """Report to the client that the command succeeded, with the new state."""
         self.answer.set_result({"ok": True, **state})
 
     def refuse(self, why: str) -> None:
-        """Tell the client that the command was refused and nothing has changed."""
+        """Report to the client that the command was refused, without any change."""
         self.answer.set_result({"ok": False, "error": why or "refused"})
 
 

@@ -1,4 +1,4 @@
-"""Change what a solver shows: load in the background, then adopt between two solutions."""
+"""Change a solver's content or model: load in the background, then adopt between two solutions."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Reconfiguration:
         self.settings, self._old, self._stack = settings, old, stack
         self._reload_content, self._slots = reload_content, slots
         self.abandoned = False
-        self.progress = ""  # what is being loaded, for the status
+        self.progress = ""  # content or model being loaded, for the status
         self.problem = ""  # why the change was refused, in one line
         self._job = BackgroundJob("reconfiguration", self._make_ready)
 

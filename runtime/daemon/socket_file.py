@@ -1,4 +1,4 @@
-"""Create the status socket's file (mode 0660), replacing one left over by a crashed daemon."""
+"""Create the status socket's file (mode 0660), replacing a crashed daemon's."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ def holds(facts: Facts, *, paused: bool, flat_asked: bool) -> dict[str, Any]:
 
 
 def shown(status: Status, *, light: Mapping[str, Any], head_of: Callable[[int], int | None]) -> dict[str, Any]:
-    """Return what a page that displays the panels needs to know of the latest refresh.
+    """Return the facts of the latest refresh for a page that displays the panels.
     `head_of` returns the number of a person's head in the sensor's true eyes.
     """
     account, frame, solution = status.refresh.account, status.refresh.frame, status.refresh.solution

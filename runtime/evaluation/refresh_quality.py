@@ -20,7 +20,7 @@ from runtime.records import F64, U8, Eyes, RefreshAccount
 
 log = logging.getLogger("phasestack.quality")
 
-# How light is sampled. A displaced view has its errors at edges, so if only a quarter of a small picture's pixels are
+# Sampling of light. A displaced view has its errors at edges, so if only a quarter of a small picture's pixels are
 # sampled, the measured live quality is off by 0.6 dB.
 ALIGNED, LIVE = Sampling(step=2), Sampling(rays=4)
 QUICK = Sampling(step=4)  # within 0.1 dB of `ALIGNED` in a third of the time, for a live page
@@ -147,7 +147,7 @@ def _at_aligned_eyes(
     unseen = EyeViews((), targets.used, Quality(math.nan, math.nan, ()), stack, eyes_m, fov_deg)
     views = unseen if for_page else displayed(layers, targets.used, stack, eyes_m=eyes_m, fov_deg=fov_deg)
     thorough = ALIGNED_LARGE if targets.solved[0].size > PLENTY else ALIGNED
-    # A live page compares what the panels show with what these eyes should see; reprojected content may be torn.
+    # A live page compares the panels' picture with these eyes' target; reprojected content may be torn.
     shown, drawn, drawn_for_m = (layers, targets.used, eyes_m) if for_page else (aligned, targets.solved, solved_for_m)
     light = expected_psnrs_db(
         shown,

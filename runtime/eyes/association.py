@@ -1,4 +1,4 @@
-"""Assign a sensor sample's heads to known people by what each can have moved."""
+"""Assign a sensor sample's heads to known people by how far each can have moved."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tell a person from a picture of one: people move and blink."""
+"""Distinguish a person from a picture of one: people move and blink."""
 
 from __future__ import annotations
 

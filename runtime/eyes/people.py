@@ -1,6 +1,6 @@
 """Follow several people, each with one tracker, and decide who is served.
 
-A sensor's heads are assigned to people by what each can have moved (`association`). A person who was hidden for longer
+A sensor's heads are assigned to people by how far each can have moved (`association`). A person hidden for longer
 than `IDENTITY_S`, or whose head could as well be another's, comes back as a new person, with a tracker that remembers
 nothing. So no tracker ever takes over another person's eyes.
 """
@@ -134,7 +134,7 @@ class People:
         return reasons
 
     def _reasons(self, seen: Sequence[EyePoints]) -> list[str]:
-        """Return why eyes cannot be those of a person, or cannot be told from another's."""
+        """Return why eyes cannot be those of a person, or cannot be distinguished from another's."""
         reasons: list[str] = []
         for points in seen:
             why = reason_against(points.eyes_m, in_front_m=self._in_front_m)

@@ -31,7 +31,7 @@ NEAREST_M = 0.1  # smaller distances from the display are raised to this
 
 
 class RestWatch:
-    """Detector that tells if a head is at rest, and where. Not thread-safe. Never reads a clock."""
+    """Detector of whether a head is at rest, and where. Not thread-safe. Never reads a clock."""
 
     def __init__(self, *, max_drift_m: float) -> None:
         """Create a detector that follows a resting head if the drift exceeds the noise by `max_drift_m`."""

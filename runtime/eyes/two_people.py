@@ -15,7 +15,7 @@ SEATS_M = np.array([[0.62, -0.22, 0.0], [0.66, 0.22, 0.0]])  # midpoints of the 
 STANDING_M = 0.35  # how far the eyes rise when a seated person stands up
 SENSOR_M = np.array([0.05, 0.02, 0.22])  # where the demo's sensor is, frame `stack`
 SEES_DEG = 35.0  # half the sensor's horizontal field of view
-HEAD_M = 0.09  # radius of a head that hides what is behind it
+HEAD_M = 0.09  # radius of a head that hides things behind it
 
 # Function that maps (n,) times in seconds to the midpoints of two people's eyes (2, n, 3) in metres, frame `stack`, and
 # their heads' tilts (2, n) in radians.

@@ -91,7 +91,7 @@ class Live:
     program: Mapping[str, Any] | None = None  # status of the program that draws the scene
     playlist: Mapping[str, Any] | None = None  # a playlist's entries and position
     seeing: tuple[bool, ...] = (True, True)  # eyes that can see the display
-    measured: Measured = field(default_factory=Measured)  # what the plan's savings are worth
+    measured: Measured = field(default_factory=Measured)  # measured worth of the plan's savings
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,8 +107,8 @@ class Done:
     """Answer to a `ChangeSettings`, `Move` or `Skip`."""
 
     number: int
-    problem: str = ""  # why nothing has changed; empty: carried out
-    facts: Facts | None = None  # None if nothing has changed
+    problem: str = ""  # reason for a refusal; empty: carried out
+    facts: Facts | None = None  # None without a change
 
 
 @dataclass(frozen=True, slots=True)

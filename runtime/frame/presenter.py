@@ -269,7 +269,7 @@ class Presenter:
         return report, ""
 
     def _presented_at(self, timing: FrameTiming, report: PresentReport | None, *, woke_ns: int) -> int:
-        """Tell the pacer what happened to a refresh, and return its display time."""
+        """Report a refresh's fate to the pacer, and return its display time."""
         if report is None:
             return self.pacer.presented(timing, woke_ns=woke_ns, done_ns=self.clock.now_ns())
         return self.pacer.presented(

@@ -195,7 +195,7 @@ class SolverProcess(SolverHost):
         return replace(solution, layers=self._slots.view(slot.index, slot.shape))
 
     def _ended(self) -> None:
-        """Forget what the solver was doing. Orders that it was carrying out are not carried out again."""
+        """Forget the solver's work. Orders that it was carrying out are not carried out again."""
         self._slots.reclaim()
         self._busy, self._since_ns = None, self._clock.now_ns()
         self._took_ns.clear()

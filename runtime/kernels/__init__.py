@@ -13,7 +13,7 @@ from functools import cache
 from importlib import import_module
 from typing import Any
 
-INTERFACE = 1  # also in binding.cpp; raised by every change to what the compiled module offers
+INTERFACE = 1  # also in binding.cpp; raised by every change to the compiled module's interface
 MAX_PANELS = 6  # a stack has 2 to 6
 SUBCODE = 16  # fixed-point units per 8-bit panel code
 FULL = 255 * SUBCODE  # range of a panel value, which rotates the polarization by up to a quarter turn

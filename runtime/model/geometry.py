@@ -144,7 +144,7 @@ class Geometry:
         return RaySets(np.array(homographies), tuple(view for views in shown for view in views), turn_of, turns)
 
     def _possible_m(self, eye_sigma_m: float) -> float:
-        """Return a standard deviation limited to what a person's head and the panels leave room for."""
+        """Return a standard deviation limited by the room that a person's head and the panels leave."""
         room_m = SIGMA_MOST_SHARE * max(float(self.eyes_m[:, 0].min()) - max(self.stack.x_m), 0.0)
         return min(eye_sigma_m, SIGMA_MOST_M, room_m)
 

@@ -1,6 +1,6 @@
 """Draw separate pictures for points of the pupils, so that eyes can focus at a depth.
 
-`content.focus` decides which content gets them: `auto` takes content that is known to lie between the panels, `on`
+`content.focus` decides which content gets them: `auto` takes content known to be between the panels, `on`
 takes any that can be drawn from any place. Stereo pairs, films and programs have two views and never qualify.
 """
 
@@ -74,7 +74,7 @@ def _drawn_on(job: Job) -> PlaneRaster | None:
 
 
 def _is_between_panels(content: ContentSource, job: Job, raster: PlaneRaster) -> bool:
-    """Return True if all content that was drawn for a job is known to lie between the outer panels."""
+    """Return True if all content that was drawn for a job is known to be between the outer panels."""
     rear_m, front_m = min(job.stack.x_m) - BETWEEN_M, max(job.stack.x_m) + BETWEEN_M
     x_m = _depths_m(content, raster_views(job.eyes_m, raster), job.stack)
     return x_m is not None and (not x_m.size or (rear_m <= float(x_m.min()) and float(x_m.max()) <= front_m))

@@ -107,7 +107,7 @@ def focal_stack(
     """Solve for two eyes, then focus the right eye at every plane of PLANES_M.
 
     `painter` draws the cards (`cards_painter`). `focus` solves with separate pictures for points of the pupils, rather
-    than for pinhole eyes. `progress` is told the number of planes finished and of all planes.
+    than for pinhole eyes. `progress` receives the number of planes finished and of all planes.
     """
     eyes = eyes_at(distance_m=DISTANCE_M)
     layers = cards_layers(painter, stack, eyes, model=model, focus=focus)

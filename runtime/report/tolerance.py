@@ -155,7 +155,7 @@ class Bench:
         return psnr_db(float(np.mean(errors)))
 
     def first(self, imperfections: Sequence[Imperfection]) -> Iterator[Cost]:
-        """Measure each imperfection at its assumed size and at what is left of it, with few pixels."""
+        """Measure each imperfection at its assumed size and at its size after the remedy, with few pixels."""
         yield from self._each(imperfections, lambda one: self._cost(one, (), PIXELS_FIRST))
 
     def curves(self, imperfections: Sequence[Imperfection]) -> Iterator[Cost]:
@@ -256,7 +256,7 @@ def filters_of(stack: PanelStack) -> tuple[bool, ...]:
 
 
 def monitor_share(stack: PanelStack) -> float:
-    """Return full white's luminance, as a share of what the rear monitor would show on its own."""
+    """Return full white's luminance, as a share of the rear monitor's alone."""
     return float(APERTURE ** (stack.count - 1) * FILTERED ** sum(filters_of(stack)[1:]))
 
 

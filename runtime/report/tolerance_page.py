@@ -421,7 +421,7 @@ def freedom_section(still: dict[str, Any], followed: Sequence[dict[str, float]])
 def seen_through(
     subject: Subject, real: RealPanels, rays: int = RAYS_PASSED, size_px: tuple[int, int] = CROP_PX
 ) -> F32:
-    """Return a crop of what the left eye sees through panels, relative to full white, from 0 to 1."""
+    """Return a crop of the left eye's view through panels, relative to full white, from 0 to 1."""
     pair, random = subject.pair, np.random.default_rng(2)
     stack, eye_m, pose = pair.stack, pair.eyes_m[0], stack_from_eye(pair.eyes_m[0])
     height, width = pair.images[0].shape[:2]
@@ -446,7 +446,7 @@ def seen_through(
 
 
 def seen_figure(subject: Subject, panels: Sequence[tuple[str, RealPanels]]) -> Figure:
-    """Return a figure of what the left eye sees through each of the named panels."""
+    """Return a figure of the left eye's view through each of the named panels."""
     with drawing(12.0, 3.2) as figure:
         for axes, (name, real) in zip(figure.subplots(1, len(panels)), panels, strict=True):
             axes.imshow(seen_through(subject, real), interpolation="nearest")

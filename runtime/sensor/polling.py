@@ -23,7 +23,7 @@ REOPEN_AFTER_S, REOPEN_AFTER_MAX_S = 0.25, 0.5  # delay before a lost sensor is 
 OPEN_TIMEOUT_S = 10.0  # time limit for opening and closing a sensor, and for loading the eye finder's networks
 HANG_MARGIN_S = 1.0  # a read hangs if it takes this much longer than its timeout
 FOREVER_S = 1e9
-SEND_AGAIN_S = 0.05  # interval for sending again what the presenter had no room for
+SEND_AGAIN_S = 0.05  # interval for sending again samples that did not fit
 QUEUE_MAX = 1024  # maximum number of unsent samples: four seconds with the fastest sensor
 PICTURES_MAX = 8  # maximum number of unsent samples with pictures
 AHEAD_NS = NS_PER_S // 1000  # a capture time more than this after the arrival is on another clock
@@ -252,7 +252,7 @@ class Polling:
             self._unsent.clear()
 
     def _wait(self, seconds: float) -> bool:
-        """Wait, and send what there was no room for. Return True if polling is to end."""
+        """Wait, and send samples that did not fit before. Return True if polling is to end."""
         until_ns = self._clock.now_ns() + round(seconds * NS_PER_S)
         while (left_ns := until_ns - self._clock.now_ns()) > 0:
             if self._recipient.is_over(min(left_ns / NS_PER_S, SEND_AGAIN_S)):

@@ -268,7 +268,7 @@ class FilmWriter:
 
 
 def _header(frame: av.VideoFrame, streams: list[Any]) -> FilmHeader:
-    """Return what a film declares, as FFmpeg reports it with the first frame."""
+    """Return a film's declarations, as FFmpeg reports them with the first frame."""
     stream, items = streams[0], cast(Any, frame.side_data)
     side = {item.type.name: bytes(item) for item in items}
     kind, flags = struct.unpack_from("<ii", side.get("STEREO3D", bytes(8)))

@@ -139,7 +139,7 @@ def configure(
     *, stream: TextIO | None = None, clock: Clock | None = None, environment: Mapping[str, str] = os.environ
 ) -> None:
     """Set up logging, again if need be, to a stream, by default stderr, or to journald. `clock` is for
-    the rate limit; `environment` tells whether the stream is journald's.
+    the rate limit; `environment` determines whether the stream is journald's.
     """
     for old in logging.getLogger(ROOTS[0]).handlers[:]:
         if isinstance(old, QueuedLines):

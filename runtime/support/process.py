@@ -39,8 +39,8 @@ log = logging.getLogger("phasestack.processes")
 
 PR_SET_PDEATHSIG = 1  # constant from Linux's prctl.h
 LOOK_S = 0.1  # interval for checking a worker's time limit and memory
-STOPPED_S = 1.0  # if this process did not run for so long, its workers are given time to catch up
-WELL_S = 1.0  # a worker that has been ready for so long was well, so the next one is started without a delay
+STOPPED_S = 1.0  # if this process was stopped for longer, its workers get time to catch up
+WELL_S = 1.0  # a worker that was ready for longer was well, so the next one is started without a delay
 AGAIN_S, AGAIN_MAX_S = 0.25, 5.0  # delay before a worker that was never well is started again; doubles each time
 ENDS_S = 0.5  # how long a worker gets to end by itself when the run ends
 SENT_S = 0.25  # how long a worker waits for its parent to read, before it renews its time limit
@@ -56,7 +56,7 @@ class Role:
     main: Callable[..., None]  # called in the worker with its `Parent` and the arguments; at the top level of a module
     niceness: int = 0
     memory_bytes: int = 0  # limit for the worker's own memory; 0: none
-    oom_score: int = 500  # what is added to the kernel's readiness to end this process if memory runs out
+    oom_score: int = 500  # raises the kernel's readiness to end this process if memory runs out
     start_s: float = 60.0  # time limit until the worker is ready
 
 
@@ -206,7 +206,7 @@ class Worker:
             self._newest.kill(f"the {self.role.name} {reason}")
 
     def status(self) -> dict[str, Any]:
-        """Return what the process uses, for the status (docs/contracts.md). May be called on any thread."""
+        """Return the process and its use of the machine, for the status (docs/contracts.md). For any thread."""
         life = self._newest
         pid = life.process.pid if life is not None and life.is_alive() else None
         return {"role": self.role.name, "restarts": self.restarts, **usage(pid)}
@@ -365,7 +365,7 @@ class Parent:
         self._words[DEADLINE] = time.monotonic_ns() + round(seconds * NS_PER_S)
 
     def ready(self) -> None:
-        """Tell the parent that this process is ready for messages."""
+        """Report to the parent that this process is ready for messages."""
         self._words[READY] = 1
 
     def receive(self, timeout_s: float = 0.0) -> list[Any]:
@@ -455,7 +455,7 @@ def _limit(role: Role) -> None:
 
 
 def _say_why(notes: Channel, error: BaseException) -> None:
-    """Tell the parent which error ends this process. An unexpected one is also written to a file."""
+    """Report the error that ends this process to the parent. An unexpected one is also written to a file."""
     cause: BaseException | None = error
     while cause is not None and not (
         isinstance(cause, MemoryError) or (isinstance(cause, OSError) and cause.errno in PASSING)

@@ -63,7 +63,7 @@ export class Look {
     this.flatness = 0;
     this.between = null; // all people's eyes that the layers were solved for, and that they are aligned to; null: `eyes`
     this.others = []; // eyes of the people whose pictures are not drawn
-    this.state = ""; // why the picture differs from what the two eyes should see
+    this.state = ""; // why the picture differs from the two eyes' targets
     this.live = false; // true if the daemon measures the light, and calls `tell`
     this.onhead = () => {}; // called after the head has moved
     this.onframe = () => {}; // called after a picture has been drawn

@@ -131,7 +131,7 @@ function changes(change) {
   refreshed();
 }
 
-// Send a command to the daemon. change: what it changes in the picture (`changes`), or undefined.
+// Send a command to the daemon. change: its effect on the picture (`changes`), or undefined.
 async function wish(command, value = null, change = undefined) {
   told(`${command} …`);
   wishes += 1;
@@ -164,7 +164,7 @@ async function reach(...request) {
   }
 }
 
-// Show why there is no picture, or why it is not of what was chosen.
+// Show why the picture is missing or does not match the choice.
 function refreshed() {
   const starting = main.querySelector(".starting"), nobody = newest?.state && !newest.people.length;
   if (starting && trouble) starting.textContent = trouble;
@@ -289,7 +289,7 @@ function settle() {
   look.others = people.filter((one) => one !== now).flatMap((one) => one.eyes_m);
 }
 
-// Tell which person this page is, and offer the pictures of all.
+// Report which person this page is, and offer the pictures of all.
 function introduce() {
   const { stack: { x_m }, is_sensor } = mode, list = form("seen_by");
   const panels = `${x_m.length} panels serve one person`, more = x_m.length < 4 ? "With four panels or tracker.viewers = 2" : "With tracker.viewers = 2";
@@ -337,13 +337,13 @@ function light() {
   else look.tell(null, tracked ? "Light at both eyes: not measured yet for this picture." : "");
 }
 
-// What the target pictures belong to. Older ones stay until the current refresh has been measured.
+// Refresh that the target pictures belong to. Older ones stay until the current refresh has been measured.
 function age({ measured_frame }) {
   if (measured === null) return "";
   return measured_frame === measured ? "Measured for this position of the head." : "Measured before the head, the scene or the model changed.";
 }
 
-// A message that explains why the picture differs from what the two eyes should see.
+// A message that explains why the picture differs from the two eyes' targets.
 function explained({ state, reason }) {
   const late = /solutions take (\d+) ms|has not answered for (\d+) ms/.exec(reason);
   if (!late) return `${state.split(":")[0]}: ${reason}`;

@@ -110,7 +110,7 @@ class _View:
     """Light that an eye sees at the sampled pixels. Only pixels that count are included."""
 
     light: F32  # (sets, P, 3)
-    white: F32  # (sets, P, 3) what it would see of white panels
+    white: F32  # (sets, P, 3) its view of white panels
     target: F32  # (P, 3)
     mask: F32  # (pixels,) 1 for a pixel that counts
 

@@ -189,7 +189,7 @@ const PLACES = (number, count) => number === 0 ? " (rear)" : number === count - 
 const NAMED = (name, count) => name.startsWith("layer-") ? `panel ${name.slice(6)}${PLACES(Number(name.slice(6)), count)}` :
   name === "seen-left" ? "seen by the left eye" : "seen by the right eye";
 
-// Where an eye is, as seen by the viewer.
+// Position of an eye, as seen by the viewer.
 function placeOf([out, right]) {
   const cm = (value) => `${Math.abs(100 * value).toFixed(0)} cm`;
   return `${cm(out)} away, ${cm(right)} to the ${right < 0 ? "left" : "right"}`;
