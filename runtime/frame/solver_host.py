@@ -96,7 +96,7 @@ class SolverHost(ABC):
         """Replace the solver, if it has a process. A reason is `was ended because it took too long`."""
 
     def status(self) -> list[dict[str, Any]]:
-        """Return the solver's process and its use of the machine, for the status. Empty if it is this process."""
+        """Return the solver's process and its resources, for the status. Empty if it is this process."""
         return []
 
     @abstractmethod

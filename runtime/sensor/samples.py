@@ -41,7 +41,7 @@ class Samples(ABC):
         return ""
 
     def status(self) -> list[dict[str, Any]]:
-        """Return the sensor's process and its use of the machine, for the status. Empty if it is this process."""
+        """Return the sensor's process and its resources, for the status. Empty if it is this process."""
         return []
 
     def recorded_ahead(self) -> list[SensorFrame]:

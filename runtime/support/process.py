@@ -206,7 +206,7 @@ class Worker:
             self._newest.kill(f"the {self.role.name} {reason}")
 
     def status(self) -> dict[str, Any]:
-        """Return the process and its use of the machine, for the status (docs/contracts.md). For any thread."""
+        """Return the process and its resources, for the status (docs/contracts.md). For any thread."""
         life = self._newest
         pid = life.process.pid if life is not None and life.is_alive() else None
         return {"role": self.role.name, "restarts": self.restarts, **usage(pid)}
