@@ -131,7 +131,7 @@ def flatness_of(frame: PanelFrame) -> float:
 def panel_draws(
     frame: PanelFrame, mounts: Sequence[Mount] = (), *, between: Interpolation = Interpolation.CUBIC
 ) -> tuple[PanelDraw, ...]:
-    """Return the draw record of each panel for a frame on its monitor, by default one that has the panel's own
+    """Return each panel's draw record for a frame on its monitor, by default one that has the panel's own
     pixels. `between` is how to read the solution where a monitor's pixels do not coincide with the layer's. Raises
     ValueError if the frame has no flat picture, but needs one.
     """
