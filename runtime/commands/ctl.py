@@ -16,6 +16,7 @@ app = typer.Typer(
     help="Control the running daemon. Exits with 1 if no daemon answers.\n\nExample: phasestack ctl scene demo",
 )
 
+Triple = tuple[float, float, float]
 Config = Annotated[Path | None, typer.Option(help="configuration file that names the daemon's socket")]
 _given_before: ContextVar[Path | None] = ContextVar("config", default=None)  # `--config` before the subcommand
 
@@ -48,29 +49,12 @@ def scene(
 def place(
     scale: Annotated[float | None, number(0.001, 1000, help="factor by which to scale the scene")] = None,
     offset: Annotated[
-        tuple[float, float, float] | None,
-        number(-10, 10, "m", help="offset in metres (out of the screen, to the right, up)"),
+        Triple | None, number(-10, 10, "m", help="offset in metres (out of the screen, right, up)")
     ] = None,
-    rotate: Annotated[
-        tuple[float, float, float] | None,
-        number(
-            -360, 360, "degrees", help="rotation in degrees about the axes that point out of the screen, right and up"
-        ),
-    ] = None,
-    turntable: Annotated[
-        float | None,
-        number(-600, 600, help="rotation speed about the vertical axis in turns per minute (0 to stop it)"),
-    ] = None,
-    convergence: Annotated[
-        float | None,
-        number(-0.1, 0.1, "m", help="distance in metres between a stereo picture's views (positive: farther away)"),
-    ] = None,
-    comfort: Annotated[
-        float | None,
-        number(
-            0, 10, "degrees", help="largest angle by which a live stereo picture's depth may differ from the display"
-        ),
-    ] = None,
+    rotate: Annotated[Triple | None, number(-360, 360, "degrees", help="rotation in degrees about these axes")] = None,
+    turntable: Annotated[float | None, number(-600, 600, help="turns per minute about the vertical axis")] = None,
+    convergence: Annotated[float | None, number(-0.1, 0.1, "m", help="metres from the left to the right view")] = None,
+    comfort: Annotated[float | None, number(0, 10, "degrees", help="limit for the depth of live stereo")] = None,
     reset: Annotated[bool, typer.Option("--reset", help="restore the configured placement")] = False,
     config: Config = None,
 ) -> None:

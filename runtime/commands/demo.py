@@ -17,10 +17,7 @@ LONGEST_S, LEAST = 45.0, 15  # the demo's time limit; minimum number of refreshe
 
 def demo(
     out: Annotated[Path, typer.Option(help="folder for pictures, frames.jsonl and summary.json")] = Path("out/demo"),
-    frames: Annotated[
-        int,
-        typer.Option(min=1, help="number of refreshes to show (the full recording has 600 and takes several minutes)"),
-    ] = FRAMES,
+    frames: Annotated[int, typer.Option(min=1, help="refreshes to show (the full recording has 600)")] = FRAMES,
     verbose: Annotated[bool, typer.Option("--verbose", help="print all figures of the summary")] = False,
     as_json: JsonOption = False,
 ) -> None:

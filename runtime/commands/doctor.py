@@ -30,6 +30,7 @@ CHECK_SENSOR_FOR_S = 3.0  # how long to wait for a sensor's first sample
 SERVICE_CONFIG = Path("/etc/phasestack/phasestack.toml")
 SLOW_MS = 150.0  # if a solution takes longer, moving viewers see a worse picture (docs/performance.md)
 MEASURED_MS = 2000.0  # if a solution is expected to take longer, it is not timed at full size
+SEE_LOG = "see the log: journalctl -u phasestack"
 NO_DEVICE = ("replay", "fixed")  # drivers that do not need a device
 
 
@@ -44,15 +45,8 @@ class Row:
 
 
 def doctor(
-    config: Annotated[
-        Path | None, typer.Option(help="configuration file to check (default: built-in settings)")
-    ] = None,
-    as_service: Annotated[
-        bool,
-        typer.Option(
-            "--service", help="check with the user, groups and configuration of the systemd service; requires root"
-        ),
-    ] = False,
+    config: Annotated[Path | None, typer.Option(help="configuration to check (default: built-in settings)")] = None,
+    as_service: Annotated[bool, typer.Option("--service", help="check as the systemd service (requires root)")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Check the settings, sensor, permissions, OpenGL, monitors, scene, model, calibration and service.
@@ -217,12 +211,8 @@ def monitors(settings: Settings) -> Iterator[Row]:
     named = {panel.connector for panel in panels}
     for monitor in there:
         known = monitor.serial or monitor.connector in named
-        yield Row(
-            "monitor",
-            "ok",
-            str(monitor),
-            "" if known else "this monitor reports no EDID serial number; select it by connector instead",
-        )
+        by_connector = "this monitor reports no EDID serial number; select it by connector instead"
+        yield Row("monitor", "ok", str(monitor), "" if known else by_connector)
     try:
         bound = bind(panels, there)
         check_modes(panels, bound, width_px=settings.stack.width_px, height_px=settings.stack.height_px)
@@ -284,10 +274,7 @@ def _rate(predictor: Predictor, backend: SolverBackend, settings: Settings) -> R
     if not predictor.has_devices:
         return Row("rate", "skip", f"cannot time the model {predictor.name}")
     coarse = replace(stack, width_px=max(64, stack.width_px // 4), height_px=max(64, stack.height_px // 4))
-    took_ms, how = (
-        16 * solution_ms(predictor, coarse, backend, runs=3),
-        f"estimated at a width of {coarse.width_px} pixels",
-    )
+    took_ms, how = 16 * solution_ms(predictor, coarse, backend, runs=3), f"estimated from {coarse.width_px} columns"
     if took_ms < MEASURED_MS:
         took_ms, how = solution_ms(predictor, stack, backend, runs=1), "measured"
     detail = f"{raster}: {took_ms:.0f} ms per full solution, or {1000 / took_ms:.1f} per second ({how})"
@@ -306,18 +293,14 @@ def calibration(settings: Settings) -> Iterator[Row]:
     if not settings.calibration.file:
         driver = settings.sensor.driver
         if is_plugin(driver) and plugin_class(driver, Sensor, field="sensor.driver").capabilities.in_stack_frame:
-            yield Row(
-                "calibration", "ok", "not needed because this sensor already delivers eye positions in the stack frame"
-            )
+            yield Row("calibration", "ok", "not needed because this sensor delivers eye positions in the stack frame")
             return
-        real = driver not in NO_DEVICE
-        remedy = "run `phasestack calibrate capture` and `calibrate solve`, then set calibration.file" if real else ""
-        yield Row(
-            "calibration",
-            "fail" if real else "ok",
-            "calibration.file is not set, so the demo calibration is in use",
-            remedy,
-        )
+        detail = "calibration.file is not set, so the demo calibration is in use"
+        remedy = "run `phasestack calibrate capture` and `calibrate solve`, then set calibration.file"
+        if driver in NO_DEVICE:
+            yield Row("calibration", "ok", detail)
+        else:
+            yield Row("calibration", "fail", detail, remedy)
         return
     found = load_calibration(Path(settings.calibration.file))
     fit = f", residual {found.file.residuals.rms_m * 1000:.1f} mm" if found.file.residuals else ""
@@ -337,32 +320,20 @@ def service(settings: Settings) -> Iterator[Row]:
     state = str(answer.get("state", "unknown"))
     age_s = float(answer.get("turn_age_s", 0.0))
     if age_s > HUNG_AFTER_S:
-        yield Row(
-            "service",
-            "fail",
-            f"the display loop has not responded for {age_s:.0f} s",
-            "see the log: journalctl -u phasestack",
-        )
+        yield Row("service", "fail", f"the display loop has not responded for {age_s:.0f} s", SEE_LOG)
     elif state.startswith("degraded"):
-        yield Row("service", "fail", f"{state} ({answer.get('reason', '')})", "see the log: journalctl -u phasestack")
+        yield Row("service", "fail", f"{state} ({answer.get('reason', '')})", SEE_LOG)
     else:
         yield Row("service", "ok", f"{state} ({answer.get('reason', '')}), pid {answer.get('pid')}")
     for process in answer.get("processes", ()):
-        restarts, detail = process.get("restarts", 0), _process_in_words(process)
+        found = "is being restarted"
+        if process.get("pid") is not None:
+            found = f"pid {process['pid']}, {process['memory_mib']} MiB, {process['cpu_s']} s of processor time"
+        detail, restarts = f"{process['role']}: {found}", process.get("restarts", 0)
         if restarts:
-            yield Row(
-                "processes", "warn", f"{detail}, restarted {restarts} times", "see the log: journalctl -u phasestack"
-            )
+            yield Row("processes", "warn", f"{detail}, restarted {restarts} times", SEE_LOG)
         else:
             yield Row("processes", "ok", detail)
-
-
-def _process_in_words(process: dict[str, Any]) -> str:
-    if process.get("pid") is None:
-        return f"{process['role']}: is being restarted"
-    return (
-        f"{process['role']}: pid {process['pid']}, {process['memory_mib']} MiB, {process['cpu_s']} s of processor time"
-    )
 
 
 def _daemon(settings: Settings) -> dict[str, Any] | None:

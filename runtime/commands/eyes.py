@@ -14,24 +14,14 @@ JSON_S = 2.0  # how long a live sensor is watched with --json
 
 def eyes(
     files: Annotated[
-        list[Path] | None,
-        typer.Argument(
-            help="pictures, films or recordings to search (default: live frames from the configured sensor)"
-        ),
+        list[Path] | None, typer.Argument(help="pictures, films, recordings (default: the sensor)")
     ] = None,
     config: Annotated[Path | None, typer.Option(help="configuration file with the sensor to use")] = None,
-    sequence: Annotated[
-        bool, typer.Option("--sequence", help="follow the viewer from picture to picture, as the daemon does")
-    ] = False,
-    rate_hz: Annotated[
-        float, number(0.1, 1000, "Hz", help="frame rate of pictures, and of films that do not specify one")
-    ] = 30.0,
+    sequence: Annotated[bool, typer.Option("--sequence", help="follow the viewer from picture to picture")] = False,
+    rate_hz: Annotated[float, number(0.1, 1000, "Hz", help="frame rate of pictures")] = 30.0,
     out: Annotated[Path | None, typer.Option(help="folder for annotated copies, which only you can read")] = None,
     as_json: Annotated[
-        bool,
-        typer.Option(
-            "--json", help="print the result as a single JSON object (a live sensor is monitored for two seconds first)"
-        ),
+        bool, typer.Option("--json", help="print one JSON object (a sensor is watched for 2 s)")
     ] = False,
 ) -> None:
     """Find the viewer's pupils and how uncertain their positions are. With --out, also draw them.

@@ -17,9 +17,7 @@ if TYPE_CHECKING:
 
 
 def identify(
-    config: Annotated[
-        Path | None, typer.Option(help="configuration file with the panels (default: show a card on every monitor)")
-    ] = None,
+    config: Annotated[Path | None, typer.Option(help="configuration with the panels (default: every monitor)")] = None,
 ) -> None:
     """Show a test card on each panel: its index, monitor, colour bars and an arrow that should point up.
 

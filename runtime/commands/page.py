@@ -13,13 +13,7 @@ DEFAULT_PORT = 8717
 def page(
     config: Annotated[Path | None, typer.Option(help="configuration file that names the daemon's socket")] = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="port to listen on (0 for any free port)")] = DEFAULT_PORT,
-    token_file: Annotated[
-        Path | None,
-        typer.Option(
-            help="file that contains the login token, created if it does not exist (default: a file in the state "
-            "folder)"
-        ),
-    ] = None,
+    token_file: Annotated[Path | None, typer.Option(help="file with the login token, created if missing")] = None,
 ) -> None:
     """Serve the operator's page, used to watch and control the running daemon.
 

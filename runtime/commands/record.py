@@ -29,18 +29,8 @@ OVER = ("ended", "failed")
 def record(
     out: Annotated[Path, typer.Option(help="recording to write (.mcap)")],
     config: ConfigOption = None,
-    images: Annotated[
-        bool, typer.Option("--images", help="also record colour and depth pictures, which show people's faces")
-    ] = False,
-    seconds: Annotated[
-        float | None,
-        number(
-            0.1,
-            RECORD_MOST_S,
-            "s",
-            help="length of the recording in seconds (default: 600, or 12 with --motion, where 3600 is the maximum)",
-        ),
-    ] = None,
+    images: Annotated[bool, typer.Option("--images", help="also record pictures, which show people's faces")] = False,
+    seconds: Annotated[float | None, number(0.1, RECORD_MOST_S, "s", help="length (default: 600; motions: 12)")] = None,
     motion: Annotated[
         str | None,
         typer.Option(
@@ -48,14 +38,9 @@ def record(
             "(two-still, two-lean, two-one-leans, two-pass, two-exchange, two-leave or two-sit)"
         ),
     ] = None,
-    seed: Annotated[
-        int | None, typer.Option(min=0, help="random seed for the head's path (only with --motion)")
-    ] = None,
-    rate_hz: Annotated[float | None, number(15, 240, "Hz", help="samples per second (only with --motion)")] = None,
-    noise_mm: Annotated[
-        float | None,
-        number(0, 100, "mm", help="standard deviation of the sensor noise on each axis (only with --motion)"),
-    ] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="random seed for the head's path (with --motion)")] = None,
+    rate_hz: Annotated[float | None, number(15, 240, "Hz", help="samples per second (with --motion)")] = None,
+    noise_mm: Annotated[float | None, number(0, 100, "mm", help="sensor noise on each axis (with --motion)")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Record eye positions, when they were seen and, with --images, pictures. Press Ctrl-C to stop.

@@ -13,9 +13,7 @@ from runtime.support.options import JsonOption
 def report(
     out: Annotated[Path, typer.Option(help="folder for index.html, report.json and the plots")] = Path("report"),
     pairs: Annotated[Path | None, typer.Option(help="folder containing case files for your own stereo pairs")] = None,
-    only_pairs: Annotated[
-        bool, typer.Option("--only-pairs", help="measure only the case files, and no built-in scenes or motions")
-    ] = False,
+    only_pairs: Annotated[bool, typer.Option("--only-pairs", help="measure only the case files")] = False,
     layers: Annotated[
         list[Path] | None,
         typer.Option(
@@ -26,12 +24,8 @@ def report(
     model: Annotated[
         list[str] | None, typer.Option(metavar="<path>", help="additional ONNX file to compare (can be repeated)")
     ] = None,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="measure only quarter-size panels and fewer reference methods")
-    ] = False,
-    processes: Annotated[
-        int, typer.Option(min=1, max=1024, help="number of measurements at the same time (above 1, times are longer)")
-    ] = 1,
+    quick: Annotated[bool, typer.Option("--quick", help="smaller panels and fewer reference methods")] = False,
+    processes: Annotated[int, typer.Option(min=1, max=1024, help="measurements at the same time")] = 1,
     as_json: JsonOption = False,
 ) -> None:
     """Measure every method's light PSNR and run time on this machine, and write a page with the results.

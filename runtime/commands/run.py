@@ -14,20 +14,10 @@ from runtime.support.options import ConfigOption, JsonOption, LayoutOption, Mode
 
 def run(
     config: ConfigOption = None,
-    replay: Annotated[
-        str | None,
-        typer.Option(
-            help="recording to play instead of reading the sensor (`demo` plays the built-in recording in a loop)"
-        ),
-    ] = None,
+    replay: Annotated[str | None, typer.Option(help="recording to play instead of the sensor, or `demo`")] = None,
     headless: Annotated[bool, typer.Option("--headless", help="render offscreen instead of opening windows")] = False,
     frames: Annotated[int | None, typer.Option(min=1, help="stop after this many refreshes")] = None,
-    max_speed: Annotated[
-        bool,
-        typer.Option(
-            "--max-speed", help="play a recording as fast as possible on a simulated clock, with reproducible results"
-        ),
-    ] = False,
+    max_speed: Annotated[bool, typer.Option("--max-speed", help="play a recording on a simulated clock")] = False,
     out: Annotated[Path | None, typer.Option(help="folder for pictures, frames.jsonl and summary.json")] = None,
     scene: Annotated[str | None, typer.Option(help="scene to show: a built-in name, a file or a folder")] = None,
     layout: LayoutOption = None,
@@ -37,9 +27,7 @@ def run(
         str | None,
         typer.Option(help="device for everything except the network: cpu, gl or auto (the faster of the two)"),
     ] = None,
-    keep_light: Annotated[
-        int, typer.Option(min=0, help="write the layers to the --out folder every N refreshes (0 for never)")
-    ] = 0,
+    keep_light: Annotated[int, typer.Option(min=0, help="write every N-th refresh's layers to --out (0: none)")] = 0,
     verbose: Annotated[bool, typer.Option("--verbose", help="print all figures of the summary")] = False,
     as_json: JsonOption = False,
 ) -> None:

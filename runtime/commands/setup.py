@@ -9,9 +9,7 @@ import typer
 
 
 def setup(
-    config: Annotated[
-        Path, typer.Option(help="configuration file to create or change (an existing file is backed up)")
-    ] = Path("phasestack.toml"),
+    config: Annotated[Path, typer.Option(help="configuration file to create or change")] = Path("phasestack.toml"),
     out: Annotated[Path, typer.Option(help="folder for point pairs, the calibration, reports and setup.json")] = Path(
         "setup"
     ),

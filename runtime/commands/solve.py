@@ -26,12 +26,8 @@ def solve(
             "pictures, the eyes and the panels)"
         ),
     ] = None,
-    right: Annotated[
-        Path | None, typer.Option(help="picture for the right eye (omit this option if --left contains both views)")
-    ] = None,
-    layout: Annotated[
-        str | None, typer.Option(help="arrangement of the views in --left (same values as the content.layout setting)")
-    ] = None,
+    right: Annotated[Path | None, typer.Option(help="the right eye's picture, unless --left contains both")] = None,
+    layout: Annotated[str | None, typer.Option(help="views in --left (values of the content.layout setting)")] = None,
     left_eye: Annotated[
         tuple[float, float, float] | None, place(help="position of the left eye in the stack frame, in metres")
     ] = None,
@@ -59,12 +55,8 @@ def solve(
             help="device for everything except the network: cpu, gl or auto (times both if --repeat is at least 10)"
         ),
     ] = None,
-    no_plan: Annotated[
-        bool, typer.Option("--no-plan", help="solve every pixel, even where this is unnecessary")
-    ] = False,
-    floats: Annotated[
-        bool, typer.Option("--floats", help="also write layers.npy, the layers before rounding to 8 bits")
-    ] = False,
+    no_plan: Annotated[bool, typer.Option("--no-plan", help="solve every pixel, even where it is unnecessary")] = False,
+    floats: Annotated[bool, typer.Option("--floats", help="also write layers.npy, not rounded to 8 bits")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print the contents of solve.json")] = False,
 ) -> None:
     """Compute the layers for still pictures, and measure how well each eye sees its picture.
@@ -75,22 +67,17 @@ def solve(
     For any number of eyes: phasestack solve --case case.json --out out/solve
     """
     from runtime.clock import Stopwatch
-    from runtime.commands.solving import Eyes, Files, asked_for, case_asked_for, solve_pictures
+    from runtime.commands.solving import Eyes, asked_for, case_asked_for, solve_pictures
     from runtime.support.figures import shown
 
     with blame_option("solve", model=model):
         watch = Stopwatch()
         if case is not None:
-            pictures: dict[str, object] = {"--left": left, "--right": right, "--layout": layout}
-            given = pictures | {
-                "--panels": panels,
-                "--camera": camera,
-                "--left-eye": left_eye,
-                "--right-eye": right_eye,
-            }
-            asked = case_asked_for(case, [option for option, value in given.items() if value is not None])
+            names = ("--left", "--right", "--layout", "--panels", "--camera", "--left-eye", "--right-eye")
+            given = zip(names, (left, right, layout, panels, camera, left_eye, right_eye))
+            asked = case_asked_for(case, [option for option, value in given if value is not None])
         else:
-            asked = asked_for(Files.of(left, right, layout), Eyes(left_eye, right_eye, fov, camera), panels)
+            asked = asked_for(left, right, layout, Eyes(left_eye, right_eye, fov, camera), panels)
         watch.lap("read pictures")
         result = solve_pictures(
             asked,

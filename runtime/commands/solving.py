@@ -48,40 +48,6 @@ class Eyes:
 
 
 @dataclass(frozen=True, slots=True)
-class Files:
-    """Two picture files, or one that contains both views."""
-
-    left: Path
-    right: Path | None
-    layout: str | None  # how the views are arranged if both are in one file
-
-    @classmethod
-    def of(cls, left: Path | None, right: Path | None, layout: str | None) -> Files:
-        """Return the files. Raises InputError if the left picture is missing."""
-        if left is None:
-            raise InputError("solve", "--left", "is required without --case; pass the left eye's picture")
-        return cls(left, right, layout)
-
-    @property
-    def name(self) -> str:
-        return self.left.name if self.right is None else f"{self.left.name} and {self.right.name}"
-
-    def read(self) -> list[Any]:
-        """Read the left and right eye's pictures. Raises InputError if that fails or they differ in size."""
-        if self.right is None:
-            return list(read_pair(self.left, with_options(Settings(), layout=self.layout).content))
-        if self.layout is not None:
-            raise InputError(
-                "solve", "--layout", "cannot be combined with --right; pass one file with both views as --left"
-            )
-        pictures = [read_image(path) for path in (self.left, self.right)]
-        if pictures[0].shape != pictures[1].shape:
-            sizes = " and ".join(f"{p.shape[1]}x{p.shape[0]}" for p in pictures)
-            raise InputError(self.right, "size", f"the pictures must have the same size, but are {sizes}")
-        return pictures
-
-
-@dataclass(frozen=True, slots=True)
 class Asked:
     """Validated pictures to solve, as seen by eyes that look at the stack's origin."""
 
@@ -93,14 +59,25 @@ class Asked:
     is_resampled: bool = False  # True if the pictures were taken by other cameras
 
 
-def asked_for(files: Files, eyes: Eyes, panels: Path | None) -> Asked:
-    """Read a stereo pair and the panels. Raises InputError if a file or an option cannot be used."""
+def asked_for(left: Path | None, right: Path | None, layout: str | None, eyes: Eyes, panels: Path | None) -> Asked:
+    """Read a stereo pair, from two files or one with a `layout`, and the panels. Raises InputError."""
+    if left is None:
+        raise InputError("solve", "--left", "is required without --case; pass the left eye's picture")
     if panels is None:
         raise InputError("solve", "--panels", "is required without --case; pass a file with width_m, height_m and x_m")
-    pictures = files.read()
+    if right is None:
+        name, pictures = left.name, list(read_pair(left, with_options(Settings(), layout=layout).content))
+    elif layout is not None:
+        problem = "cannot be combined with --right; pass one file with both views as --left"
+        raise InputError("solve", "--layout", problem)
+    else:
+        name, pictures = f"{left.name} and {right.name}", [read_image(path) for path in (left, right)]
+        if pictures[0].shape != pictures[1].shape:
+            sizes = " and ".join(f"{p.shape[1]}x{p.shape[0]}" for p in pictures)
+            raise InputError(right, "size", f"the pictures must have the same size, but are {sizes}")
     stack = load_stack(panels, width_px=pictures[0].shape[1], height_px=pictures[0].shape[0])
     pictures, eyes_m, fov_deg = taken(pictures, eyes, stack)
-    return Asked(files.name, pictures, stack, eyes_m, fov_deg, eyes.cameras is not None)
+    return Asked(name, pictures, stack, eyes_m, fov_deg, eyes.cameras is not None)
 
 
 def case_asked_for(case: Path, others: list[str]) -> Asked:

@@ -12,19 +12,10 @@ from runtime.support.options import JsonOption, number
 
 
 def tolerance(
-    config: Annotated[
-        Path | None, typer.Option(help="configuration file whose [stack] is to be built (default: the default stack)")
-    ] = None,
-    pairs: Annotated[
-        Path | None,
-        typer.Option(help="folder of case files, your own pictures with their eyes and panels (replaces --config)"),
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option(help="folder for index.html, tolerance.json and the plots [default: tolerance]")
-    ] = None,
-    distance_m: Annotated[
-        float | None, number(0.05, 50.0, "m", help="distance of the viewer (default: 0.6; case files have their own)")
-    ] = None,
+    config: Annotated[Path | None, typer.Option(help="configuration whose [stack] is to be built")] = None,
+    pairs: Annotated[Path | None, typer.Option(help="folder of case files, which replaces --config")] = None,
+    out: Annotated[Path | None, typer.Option(help="folder for index.html and tolerance.json")] = None,
+    distance_m: Annotated[float | None, number(0.05, 50.0, "m", help="distance of the viewer (default: 0.6)")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Measure the cost of each imperfection of real panels, crosstalk, and viewing freedom.

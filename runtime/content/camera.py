@@ -13,14 +13,10 @@ NEAREST_M = 1e-3  # distance from the eye to the near plane
 
 
 def clip_from_stack(view: View, *, near_m: float, far_m: float) -> F64:
-    """Return the 4x4 OpenGL clip matrix for a view. Raises ValueError if all content is behind the eye.
+    """Return the 4x4 OpenGL clip matrix for a view, whose far plane is farther than the near one.
     The raster's v axis is mapped to OpenGL's +y, whose rows are stored bottom first, so pictures that are read back
     need not be flipped.
     """
-    if not 0.0 < near_m < far_m:
-        raise ValueError(
-            f"near {near_m} and far {far_m} are not valid clipping distances; far must be greater than near"
-        )
     u, v, w = view.pixels_from_stack
     span = far_m - near_m
     depth = w * ((far_m + near_m) / span) + np.array([0.0, 0.0, 0.0, -2.0 * far_m * near_m / span])

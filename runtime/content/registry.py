@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from importlib import import_module
 from inspect import signature
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ from runtime.support.plausible import nearest
 from runtime.support.plugins import is_plugin, plugin_class, strict
 from runtime.support.untrusted_input import LIMITS
 
+LIVE = ("program", "pipe", "window")  # modules of this package that show pictures from elsewhere
 MESHES = (".glb", ".gltf", ".obj", ".off", ".stl")
 SPLATS = (".ply", ".splat", ".spz", ".sog")  # a .ply may be a mesh
 PLAYLISTS = (".toml", ".json")
@@ -83,24 +85,14 @@ def _prepared(file: SceneFile) -> Opener:
         return _built_in(name, file)
     if name in preset_names():
         if not settings.file:
-            raise InputError(
-                "content",
-                "file",
-                f"is missing; set it to the .ply file, .glb file or data-set folder of {name}, which is not shipped",
+            problem = (
+                f"is missing; set it to the .ply file, .glb file or data-set folder of {name}, which is not shipped"
             )
+            raise InputError("content", "file", problem)
         return _from_path(replace(file, path=Path(settings.file), preset=name))
-    if name == "program":
-        from runtime.content import program
-
-        return program.prepare(file)
-    if name == "pipe":
-        from runtime.content import pipe
-
-        return pipe.prepare(file)
-    if name == "window":
-        from runtime.content import window
-
-        return window.prepare(file)
+    if name in LIVE:
+        prepare: Callable[[SceneFile], Opener] = import_module(f"runtime.content.{name}").prepare
+        return prepare(file)
     if name.lower().startswith("file://"):
         path = unquote(urlsplit(name).path)
         return _prepared(replace(file, path=Path(path), settings=file.settings.model_copy(update={"scene": path})))
@@ -108,9 +100,7 @@ def _prepared(file: SceneFile) -> Opener:
         problem = "is on another computer; mount the share, and set the path where it is mounted"
         raise InputError("content", "scene", f"{untrusted_input.shown(without_secrets(name))} {problem}")
     if "://" in name or name.startswith("/dev/video"):
-        problem = (
-            "live pictures require the scene `pipe` or `window`, your own class or a program; see docs/programs.md"
-        )
+        problem = "live pictures require the scene `pipe` or `window`, your own class or a program (docs/programs.md)"
         raise InputError("content", "scene", f"{untrusted_input.shown(without_secrets(name))}: {problem}")
     if is_plugin(name):
         return _plugin(name, file)
