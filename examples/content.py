@@ -16,6 +16,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -65,11 +66,6 @@ def side_by_side(folder: Path, *, half: bool = False) -> Made:
     return str(folder / name), ""
 
 
-def half_side_by_side(folder: Path) -> Made:
-    """Write two views side by side, compressed to half the columns."""
-    return side_by_side(folder, half=True)
-
-
 def quilt(folder: Path) -> Made:
     """Write a quilt: the views from 24 cameras in one picture."""
     columns, rows, wide, high = 8, 3, 240, 135
@@ -104,8 +100,8 @@ def film(folder: Path) -> Made:
     return str(folder / "film_sbs.mp4"), ""
 
 
-def mesh(folder: Path, suffix: str) -> Made:
-    """Write a mesh of two coloured shapes, in the format given by the suffix."""
+def mesh(folder: Path, *, suffix: str) -> Made:
+    """Write a mesh of two shapes, with vertex colours unless the format has none (STL)."""
     import trimesh
 
     parts = [trimesh.creation.torus(1.0, 0.35), trimesh.creation.icosphere(subdivisions=3, radius=0.5)]
@@ -115,16 +111,6 @@ def mesh(folder: Path, suffix: str) -> Made:
     path = folder / f"ring{suffix}"
     trimesh.util.concatenate(parts).export(path)
     return str(path), ""
-
-
-def obj(folder: Path) -> Made:
-    """Write a mesh with vertex colours as an OBJ file."""
-    return mesh(folder, ".obj")
-
-
-def stl(folder: Path) -> Made:
-    """Write a mesh without colours as an STL file."""
-    return mesh(folder, ".stl")
 
 
 def splats(folder: Path) -> Made:
@@ -147,14 +133,9 @@ def splats(folder: Path) -> Made:
     return str(folder / "splats.ply"), "axes = '+z +x'\nrotation_deg = [0, 25, 20]"
 
 
-def gltf(folder: Path) -> Made:
-    """Write a mesh with vertex colours as a binary glTF file."""
-    return mesh(folder, ".glb")
-
-
 def playlist(folder: Path) -> Made:
     """Write a playlist that shows three scenes for half a second each."""
-    stl(folder)
+    mesh(folder, suffix=".stl")
     rgbd(folder)
     (folder / "evening.toml").write_text(
         "[[show]]\nscene = 'ring.stl'\nseconds = 0.5\nturntable_per_min = 20\n\n"
@@ -179,9 +160,10 @@ def placed(folder: Path) -> Made:
 
 
 KINDS: dict[str, Callable[[Path], Made]] = {
-    "picture": picture, "side-by-side": side_by_side, "half-side-by-side": half_side_by_side, "quilt": quilt,
-    "rgbd": rgbd, "film": film, "obj": obj, "stl": stl, "splats": splats,
-    "gltf": gltf, "playlist": playlist, "data-set": data_set, "placed": placed,
+    "picture": picture, "side-by-side": side_by_side, "half-side-by-side": partial(side_by_side, half=True),
+    "quilt": quilt, "rgbd": rgbd, "film": film, "obj": partial(mesh, suffix=".obj"),
+    "stl": partial(mesh, suffix=".stl"), "splats": splats, "gltf": partial(mesh, suffix=".glb"),
+    "playlist": playlist, "data-set": data_set, "placed": placed,
 }  # fmt: skip
 
 
@@ -201,33 +183,13 @@ def main() -> int:
         scene, further = KINDS[kind](folder)
         config = folder / "phasestack.toml"
         config.write_text(f"[content]\nscene = {json.dumps(scene)}\n{further}\n")
-        command = [
-            sys.executable,
-            "-m",
-            "runtime.cli",
-            "run",
-            "--config",
-            str(config),
-            "--replay",
-            "demo",
-            "--headless",
-        ]
-        command += [
-            "--max-speed",
-            "--frames",
-            str(given.frames),
-            "--scale",
-            given.scale,
-            "--out",
-            str(folder),
-            "--json",
-        ]
+        options = f"--replay demo --headless --max-speed --json --frames {given.frames} --scale {given.scale}".split()
+        command = [sys.executable, "-m", "runtime.cli", "run", "--config", str(config), "--out", str(folder), *options]
         done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
         if done.returncode:
             return done.returncode
         result = json.loads(done.stdout)
-        psnr_db, name = result["psnr_db"], result["scene"]
-        print(f"{kind:18} {psnr_db:6.2f} dB  {name}  {folder / 'contact-sheet.png'}", flush=True)
+        print(f"{kind:18} {result['psnr_db']:6.2f} dB  {result['scene']}  {folder / 'contact-sheet.png'}", flush=True)
     return 0
 
 

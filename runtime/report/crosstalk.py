@@ -7,8 +7,8 @@ Electron. Imaging 21 (2012) 040902). Standards measure it with patches that fill
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -24,6 +24,7 @@ from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack
 from runtime.records import F64, U8, Eyes
 from runtime.report.pairs import PairPainter, StillPair, eyes_at
+from runtime.report.tolerance import solved
 
 WIDTH_PX = 960  # crosstalk is measured on panels with at most this many columns
 PATCHES_MM = (2.0, 4.0, 6.0, 10.0, 20.0, 40.0, 80.0)
@@ -180,14 +181,11 @@ def _crossing(moves: Sequence[float], lights: Sequence[float]) -> float | None:
 PLACES = ((0.4, 0.0), (0.6, 0.0), (0.9, 0.0), (1.2, 0.0), (0.6, 20.0), (0.6, 40.0))  # distance in m, angle in degrees
 
 
-def freedom_with_tracking(
-    stack: PanelStack, scene: str, solve: Callable[[StillPair], float]
-) -> Iterator[dict[str, float]]:
-    """Yield `distance_m`, `angle_deg` and `light_db`, by `solve`, at `PLACES` in front of the panels."""
-    small = reduced(stack)
-    with PairPainter(scene, replace(small)) as painter:
+def freedom_with_tracking(stack: PanelStack, scene: str) -> Iterator[dict[str, float]]:
+    """Yield `distance_m`, `angle_deg` and the `light_db` of layers solved for `PLACES` in front of the panels."""
+    with PairPainter(scene, reduced(stack)) as painter:
         for distance_m, angle_deg in PLACES:
             eyes_m = eyes_at(distance_m=distance_m, angle_deg=angle_deg, height_m=0.03)
             if eyes_m[:, 0].min() > stack.x_m[-1] + NEAR_M:
-                light_db = solve(painter.pair("", eyes_m, off_mm=()))
+                light_db = psnr_db(solved(painter.pair("", eyes_m, off_mm=())).ideal_error)
                 yield {"distance_m": distance_m, "angle_deg": angle_deg, "light_db": light_db}

@@ -17,7 +17,6 @@ from runtime.config import ModelSettings, load_settings
 from runtime.errors import InputError
 from runtime.model.predictor import load_predictor
 from runtime.optics.pupil import PUPIL_MM
-from runtime.optics.quality import psnr_db
 from runtime.optics.real.cells import Cell, Curve
 from runtime.optics.real.panels import RealPanels
 from runtime.optics.real.trace import Tables, crossings
@@ -125,29 +124,16 @@ class ToleranceRun:
     def _measure_compensation(self, bench: Bench) -> None:
         self._progress("compensation")
         found = compensations()
-        lights = list(bench.lights([make for _, *both in found for make in both], PIXELS))
-        rows: list[dict[str, Any]] = [
-            {"name": name, "before_db": lights[2 * n], "after_db": lights[2 * n + 1]}
-            for n, (name, _, _) in enumerate(found)
+        lights = bench.lights([make for _, *both in found for make in both], PIXELS)
+        both_db = list(zip([name for name, _, _ in found], lights, lights))  # before and after
+        self.record["compensation"] = [
+            {"name": name, "before_db": before_db, "after_db": after_db} for name, before_db, after_db in both_db
         ]
-        self.record["compensation"] = rows
-        shown = [
-            [
-                row["name"],
-                f"{row['before_db']:.2f}",
-                f"{row['after_db']:.2f}",
-                f"{row['after_db'] - row['before_db']:.2f}",
-            ]
-            for row in rows
-        ]
+        shown = [[name, *(f"{db:.2f}" for db in (before, after, after - before))] for name, before, after in both_db]
         angles = [row for row in shown if "full white" in row[0]]
-        tables = [
-            Table(
-                ["panels", "grey calibrated, 90 and 0 degrees assumed, dB", "and the angles given, dB", "gained, dB"],
-                angles,
-            ),
-            Table(["panels", "delay unknown to the alignment, dB", "known, dB", "gained, dB"], shown[len(angles) :]),
-        ]
+        given = ["panels", "grey calibrated, 90 and 0 degrees assumed, dB", "and the angles given, dB", "gained, dB"]
+        known = ["panels", "delay unknown to the alignment, dB", "known, dB", "gained, dB"]
+        tables = [Table(given, angles), Table(known, shown[len(angles) :])]
         self._sections["compensation"] = PageSection(
             "Compensation",
             ["First table: calibrate grey has measured the panels' grey curves (if not: Tolerances). It takes black "
@@ -163,13 +149,10 @@ class ToleranceRun:
         predictor = load_predictor("balanced", small, ModelSettings(backend="cpu"))
         try:
             patches = Patches(small, pair.eyes_m, predictor)
-            sizes, disparities = [], []
-            for found in patches.sizes():
-                sizes.append(found)
-                self._progress(f"crosstalk: a patch of {found.patch_mm:.0f} mm")
-            for found in patches.disparities():
-                disparities.append(found)
-                self._progress(f"crosstalk: a disparity of {found.disparity_mm:.0f} mm")
+            self._progress("crosstalk by size of a patch")
+            sizes = list(patches.sizes())
+            self._progress("crosstalk by disparity")
+            disparities = list(patches.disparities())
         finally:
             predictor.close()
         self.record["crosstalk"] = [asdict(found) for found in sizes]
@@ -183,14 +166,8 @@ class ToleranceRun:
         subject = bench.subjects[0]
         self._progress("viewing freedom without tracking")
         still = freedom_without_tracking(subject.pair, subject.layers)
-        followed: list[dict[str, float]] | None = None
-        if drawn:
-            followed = []
-            for place in freedom_with_tracking(stack, SCENE, lambda pair: psnr_db(solved(pair).ideal_error)):
-                followed.append(place)
-                self._progress(
-                    f"viewing freedom with tracking: {place['distance_m']} m, {place['angle_deg']:g} degrees"
-                )
+        self._progress("viewing freedom with tracking")
+        followed = list(freedom_with_tracking(stack, SCENE)) if drawn else None
         self.record["viewing_freedom"] = {"without_tracking": still, "with_tracking": followed}
         self._sections["freedom"] = freedom_section(still, followed or ())
 
@@ -198,13 +175,9 @@ class ToleranceRun:
         self._progress("drawing what the left eye sees")
         subject = bench.subjects[0]
         both = [together(IMPERFECTIONS, subject.pair.stack, left=left) for left in (False, True)]
-        found = self.record["together"]
-        names = [
-            f"ideal panels, {bench.ideal_db:.1f} dB",
-            f"mounted by hand, {found['assumed_db']:.1f} dB",
-            f"and calibrated, {found['left_db']:.1f} dB",
-        ]
-        figure = seen_figure(subject, list(zip(names, (RealPanels(), *both), strict=True)))
+        lights = bench.ideal_db, self.record["together"]["assumed_db"], self.record["together"]["left_db"]
+        kinds = zip(("ideal panels", "mounted by hand", "and calibrated"), lights, (RealPanels(), *both))
+        figure = seen_figure(subject, [(f"{name}, {db:.1f} dB", panels) for name, db, panels in kinds])
         self._sections["seen"] = PageSection("What the left eye sees", figures=[figure])
 
     def _write(self) -> None:
