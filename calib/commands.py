@@ -27,12 +27,8 @@ app = typer.Typer(
 def panels(
     out: Annotated[Path | None, typer.Option(help="folder to write the registration to")] = None,
     photos: Annotated[Path | None, typer.Option(help="folder containing 8 to 20 photographs of the boards")] = None,
-    show: Annotated[
-        bool, typer.Option("--show", help="show the boards on the panels until Enter or q is pressed")
-    ] = False,
-    write: Annotated[
-        bool, typer.Option("--write", help="write distances, tilts and homographies to the --config file")
-    ] = False,
+    show: Annotated[bool, typer.Option("--show", help="show the boards until Enter or q is pressed")] = False,
+    write: Annotated[bool, typer.Option("--write", help="write the results to the --config file")] = False,
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -68,9 +64,7 @@ def grey(
     out: Annotated[Path | None, typer.Option(help="CSV file to write the LUT to")] = None,
     panel: Annotated[int, typer.Option(help="index of the panel (0 for the rear panel)", min=0)] = 0,
     photos: Annotated[Path | None, typer.Option(help="folder containing two or three photographs of the chart")] = None,
-    show: Annotated[
-        bool, typer.Option("--show", help="show the chart on the panel until Enter or q is pressed")
-    ] = False,
+    show: Annotated[bool, typer.Option("--show", help="show the chart until Enter or q is pressed")] = False,
     white_deg: Annotated[float, number(1.0, 90.0, help="angle by which full white turns the polarization")] = 90.0,
     black_deg: Annotated[float, number(0.0, 89.0, help="angle by which black turns the polarization")] = 0.0,
     config: ConfigOption = None,
@@ -129,9 +123,7 @@ def charts(
 def capture(
     out: Annotated[Path, typer.Option(help="CSV file for the pairs (new pairs are appended to an existing file)")],
     config: ConfigOption = None,
-    replay: Annotated[
-        str | None, typer.Option(help="recording to use instead of the sensor (`demo` for the built-in recording)")
-    ] = None,
+    replay: Annotated[str | None, typer.Option(help="recording to use instead of the sensor, or `demo`")] = None,
     show: Annotated[bool, typer.Option("--show", help="show the charts on the panels")] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -162,17 +154,9 @@ def capture(
 
 @app.command()
 def solve(
-    pairs: Annotated[
-        Path, typer.Option(help="CSV or JSON file containing point pairs in metres (sensor_x, stack_x, ...)")
-    ],
+    pairs: Annotated[Path, typer.Option(help="CSV or JSON file of pairs in metres (sensor_x, stack_x, ...)")],
     out: Annotated[Path, typer.Option(help="calibration file (TOML) to write (an existing file is backed up)")],
-    method: Annotated[
-        str,
-        typer.Option(
-            help="method to use: seed, least-squares, inverse, robust or fixed-scale (default: the best method "
-            "for these pairs)"
-        ),
-    ] = "",
+    method: Annotated[str, typer.Option(help="seed, least-squares, inverse, robust or fixed-scale")] = "",
     scale: Annotated[float, number(*SCALE, help="known scale (fixed-scale method only)")] = 1.0,
     config: ConfigOption = None,
     as_json: JsonOption = False,

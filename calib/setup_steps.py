@@ -277,25 +277,15 @@ def gather(config: Path, out: Path) -> list[str]:
 
 
 STEPS = (
-    SetupStep(
-        "identify", "Assign monitors to panels", "each monitor shows a card in turn; say which panel you see", identify
-    ),
-    SetupStep(
-        "geometry",
-        "Enter sizes and distances",
-        "enter the size of the panels, the approximate gap and the distance of the viewers",
-        geometry,
-    ),
-    SetupStep(
-        "registration", "Register the panels", "take a dozen hand-held photographs of test patterns", registration
-    ),
+    SetupStep("identify", "Assign monitors to panels",
+              "each monitor shows a card in turn; say which panel you see", identify),
+    SetupStep("geometry", "Enter sizes and distances",
+              "enter the size of the panels, the approximate gap and the distance of the viewers", geometry),
+    SetupStep("registration", "Register the panels",
+              "take a dozen hand-held photographs of test patterns", registration),
     SetupStep("grey", "Measure the panels' grey curves", "take two photographs of a chart on each panel", grey),
     SetupStep("sensor", "Choose the depth sensor", "choose the sensor that tracks the viewer's eyes", sensor),
-    SetupStep(
-        "calibration",
-        "Calibrate the sensor",
-        "at 9 to 27 viewpoints, stand where the lines fuse and press Enter; press q when you have enough",
-        calibration,
-    ),
+    SetupStep("calibration", "Calibrate the sensor",
+              "at 9 to 27 viewpoints, stand where the lines fuse and press Enter; press q at the end", calibration),
     SetupStep("service", "The service", "gather the service's files and, if run as root, install them", service),
-)
+)  # fmt: skip

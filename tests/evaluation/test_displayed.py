@@ -131,18 +131,6 @@ def test_transparency_lets_white_through_in_every_format_that_has_it(tmp_path: P
     np.testing.assert_allclose(read_image(path).astype(int), np.array(expected, dtype=int), atol=1)
 
 
-def test_a_palette_with_a_transparent_colour_is_composed_too(tmp_path: Path) -> None:
-    from PIL import Image
-
-    image = Image.new("P", (4, 2))
-    image.putpalette([10, 20, 30, 200, 100, 50] + [0] * 762)
-    image.putdata([0, 1, 0, 1, 1, 1, 0, 0])
-    image.save(tmp_path / "a.png", transparency=1)
-    read = read_image(tmp_path / "a.png")
-    assert read[0, 0].tolist() == [10, 20, 30]
-    assert read[0, 1].tolist() == [255, 255, 255]
-
-
 CUT_OFF = cv2.imencode(".png", np.zeros((8, 8, 3), np.uint8))[1].tobytes()[:60]
 
 

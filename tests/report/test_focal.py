@@ -32,21 +32,12 @@ def stack() -> focal.FocalStack:
 
 
 @pytest.mark.slow
-def test_the_true_cards_are_sharpest_where_they_stand(stack: focal.FocalStack) -> None:
+def test_cards_are_sharpest_where_they_stand_and_layers_keep_their_order(stack: focal.FocalStack) -> None:
+    """On a flat panel, all three cards are sharpest in one plane. What is sharp everywhere is not what a pupil sees."""
     for card in stack.cards:
         assert card.sharpest_true_m == pytest.approx(card.card_m, abs=0.008)
-
-
-@pytest.mark.slow
-def test_through_the_layers_nearer_cards_are_sharpest_nearer(stack: focal.FocalStack) -> None:
-    """Impossible on a flat panel: the depths in which the three cards are sharpest differ, in the right order."""
     behind, _, before = (card.sharpest_shown_m for card in stack.cards)
     assert behind > before
-
-
-@pytest.mark.slow
-def test_the_retina_s_error_is_told(stack: focal.FocalStack) -> None:
-    """A picture that is sharp everywhere is not what a pupil sees of cards at three depths."""
     assert 20 < stack.retina_db < 40
 
 

@@ -213,23 +213,6 @@ def test_added_models_stand_beside_the_curves_and_every_pair_is_a_dot(monkeypatc
     assert sum(len(dots.get_offsets()) for dots in axes.collections) == 8
 
 
-def test_the_axis_of_times_has_ticks_at_one_two_and_five(monkeypatch: pytest.MonkeyPatch) -> None:
-    figures: list[Any] = []
-    monkeypatch.setattr(sections, "png", lambda figure: (figure.canvas.draw(), figures.append(figure), b"")[2])
-    sections.frontier_plot([method("fast", "network", 59, 36), method("best", "network", 310, 42)], name="test")
-    axis = figures[0].axes[0].xaxis
-    low, high = figures[0].axes[0].get_xlim()
-    shown = [label.get_text() for label in axis.get_ticklabels() if low <= label.get_position()[0] <= high]
-    assert shown == ["50", "100", "200"]
-
-
-def test_a_motion_measured_with_auto_alone_is_in_the_legend(monkeypatch: pytest.MonkeyPatch) -> None:
-    figures: list[Any] = []
-    monkeypatch.setattr(sections, "png", lambda figure: (figures.append(figure), b"")[1])
-    sections.moving_plot([Moving("still", "auto", 25.0, (3.0, 7.0), {"auto": 5.0}, 9)])
-    assert [text.get_text() for text in figures[0].axes[0].get_legend().get_texts()] == ["still"]
-
-
 def test_the_page_needs_nothing_from_elsewhere() -> None:
     page = report_page()
     html = page.html()
