@@ -319,11 +319,7 @@ TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
     [
         ("a.obj", "v\n", ""),
         ("a.obj", "v 0 0 0\nv 1 0 nan\nv 0 1 0\nf 1 2 3\n", "vertices: 1 of 3 vertices are not finite or exceed 1e+15"),
-        (
-            "a.obj",
-            "v 0 0 0\nv 1 0 1e300\nv 0 1 0\nf 1 2 3\n",
-            "vertices: 1 of 3 vertices are not finite or exceed 1e+15",
-        ),
+        ("a.obj", "v 0 0 0\nv 1 0 1e300\nv 0 1 0\nf 1 2 3\n", "vertices: 1 of 3 vertices are not finite"),
         ("a.obj", "v 0 0 0\nv 1 0 fish\nv 0 1 0\nf 1 2 3\n", "cannot be read as a mesh"),
         ("a.obj", TRIANGLE + "f 1 2 9\n", "cannot be read as a mesh"),
         ("a.off", "OFF\n3 2 0\n0 0 0\n1 0 0\n0 1 0\n9 0 1 2\n3 0 1 2\n", "cannot be read as a mesh"),

@@ -105,10 +105,7 @@ def test_pictures_in_a_heic_that_are_no_pair_stay_apart(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("layout", "names"),
     [
-        (
-            "side-by-side",
-            "film-sbs.png film.sbs.png a_LR.jpg a.left-right.png a_2x1.png a_3dh.mp4 a_sbs_1080p.mkv sbs.png",
-        ),
+        ("side-by-side", "film-sbs.png film.sbs.png a_LR.jpg a.left-right.png a_2x1.png a_3dh.mp4 a_sbs_1080p.mkv"),
         ("half-side-by-side", "Film.2012.3D.HSBS.1080p.mkv a.H-SBS.x264-GRP.mkv a_half_sbs.png a_hsbs(2).png"),
         ("top-bottom", "a_TaB.png a.top-bottom.png a_tb.png a_ou.png a_tb_4k.mp4 Film.3D.OverUnder.mkv"),
         ("half-top-bottom", "a_htb.png a_hou.png Film.3D.Half-OU.BluRay.mkv a_half_tb.png"),
