@@ -182,7 +182,7 @@ PLACES = ((0.4, 0.0), (0.6, 0.0), (0.9, 0.0), (1.2, 0.0), (0.6, 20.0), (0.6, 40.
 
 
 def freedom_with_tracking(stack: PanelStack, scene: str) -> Iterator[dict[str, float]]:
-    """Yield `distance_m`, `angle_deg` and the `light_db` of layers solved for `PLACES` in front of the panels."""
+    """Yield `distance_m`, `angle_deg` and the `light_db` of layers that are solved for each of `PLACES`."""
     with PairPainter(scene, reduced(stack)) as painter:
         for distance_m, angle_deg in PLACES:
             eyes_m = eyes_at(distance_m=distance_m, angle_deg=angle_deg, height_m=0.03)
