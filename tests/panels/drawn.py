@@ -15,7 +15,19 @@ from runtime.panels.registry import OffscreenPanels
 from runtime.records import U8, PanelFrame, PresentReport
 
 
-class DrawnPanels(OffscreenPanels):
+class ReadPanels(OffscreenPanels):
+    """Offscreen panels whose last frame can be read back."""
+
+    def present(self, frame: PanelFrame, *, unchanged: bool = False, due_ns: int | None = None) -> PresentReport:
+        self._frame = frame
+        return super().present(frame, unchanged=unchanged)
+
+    def read_back(self) -> tuple[U8, ...]:
+        """The monitors' pictures of the last frame, rear to front: (h, w, 4) RGBA each, top row first."""
+        raise NotImplementedError
+
+
+class DrawnPanels(ReadPanels):
     """Offscreen panels whose `read_back` uploads missing layers and draws."""
 
     def __init__(
@@ -39,12 +51,7 @@ class DrawnPanels(OffscreenPanels):
             self._painters.append(alike[0] if alike else Painter(context, mount))  # compiling shaders is slow
             self._targets.append(context.framebuffer([context.texture(screen, 4)]))
 
-    def present(self, frame: PanelFrame, *, unchanged: bool = False, due_ns: int | None = None) -> PresentReport:
-        self._frame = frame
-        return super().present(frame, unchanged=unchanged)
-
     def read_back(self) -> tuple[U8, ...]:
-        """The monitors' pictures of the last frame, rear to front: (h, w, 4) RGBA each, top row first."""
         pictures = []
         self._textures.upload(self._frame)
         draws = panel_draws(self._frame, [painter.mount for painter in self._painters])
@@ -72,7 +79,7 @@ class DrawnPanels(OffscreenPanels):
         super().close()
 
 
-class ProcessorDrawnPanels(OffscreenPanels):
+class ProcessorDrawnPanels(ReadPanels):
     """Offscreen panels drawn on the processor."""
 
     def __init__(self, *, clock: Clock, size_px: tuple[int, int], panels: tuple[PanelSettings, ...]) -> None:
@@ -86,15 +93,10 @@ class ProcessorDrawnPanels(OffscreenPanels):
             self._screens.append(np.zeros((*screen[::-1], 4), np.uint8))
         self._painter = ProcessorPainter(mounts, mountings, self._screens)
 
-    def present(self, frame: PanelFrame, *, unchanged: bool = False, due_ns: int | None = None) -> PresentReport:
-        self._frame = frame
-        return super().present(frame, unchanged=unchanged)
-
     def drawn(self, frame: PanelFrame) -> dict[int, PixelRect]:
         """The part of each panel's picture that a frame changes, by the panel's number."""
         return self._painter.draw(frame)
 
     def read_back(self) -> tuple[U8, ...]:
-        """The monitors' pictures of the last frame, rear to front: (h, w, 4) RGBA each, top row first."""
         self._painter.draw(self._frame)
         return tuple(screen[..., [2, 1, 0, 3]] for screen in self._screens)

@@ -17,7 +17,7 @@ from runtime.records import U8, PanelFrame
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.05), 320, 180)
 HEAD = np.array([[0.6, -0.031, 0.02], [0.6, 0.031, 0.02]])
 KEYSTONE = ((1.01, 0.02, -2.3), (-0.015, 0.99, 1.6), (2e-5, -1e-5, 1.0))
-STILL, MOVED, FAR = (0.0, 0.0, 0.0), (0.02, 0.016, -0.01), (-0.1, -0.2, 0.05)
+STILL, MOVED, FAR, FARTHEST = (0.0, 0.0, 0.0), (0.02, 0.016, -0.01), (-0.1, -0.2, 0.05), (0.0, 9.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,9 @@ ROWS: dict[str, Row] = {
     "reprojected": Row(),
     "mixed": Row(flatness=0.3),
     "off the edge": Row(FAR),
+    "at the limit": Row(FARTHEST, relief=False),
     "coarse": Row(STILL, relief=False, coarser=2),
+    "coarse, aligned": Row(relief=False, coarser=4),
     "coarse, moved": Row(coarser=3),
     "coarse, mixed": Row(coarser=2, flatness=0.6),
     "tilted": Row(stack=TILTED),
@@ -78,6 +80,9 @@ ROWS: dict[str, Row] = {
     "homography, flat": Row(flatness=1.0, settings=PanelSettings(homography=KEYSTONE)),
     "homography, mixed": Row(flatness=0.3, settings=PanelSettings(homography=KEYSTONE, gamma=1.2)),
     "homography, coarse": Row(coarser=2, relief=False, settings=PanelSettings(homography=KEYSTONE)),
+    "homography, turned, mirrored": Row(
+        settings=PanelSettings(homography=KEYSTONE, rotation_deg=180, mirror="vertical")
+    ),
 }  # fmt: skip
 UNMOUNTED = [name for name, row in ROWS.items() if row.settings == PanelSettings()]  # the browser has no monitors
 

@@ -16,6 +16,7 @@ import pytest
 
 from runtime.commands.doctor import doctor, monitors
 from runtime.commands.identify import identify
+from runtime.config import load_settings
 from runtime.errors import InputError
 from runtime.panels.card import BARS
 from runtime.panels.geometry import mounting_of, panel_from_screen
@@ -24,10 +25,12 @@ from tests.panels.edids import block
 from tests.panels.xserver import HEIGHT_PX, WIDTH_PX, XServer
 from tests.waiting import eventually
 
-BOUND = f"""
+STACK = f"""
 [stack]
 width_px = {WIDTH_PX}
 height_px = {HEIGHT_PX}
+"""
+BOUND = f"""{STACK}
 [output]
 kind = "windows"
 [[output.panels]]
@@ -146,3 +149,30 @@ def test_the_doctor_names_a_panel_whose_monitor_is_missing(
     assert result.exit_code == 1
     assert "panel 1: no monitor has EDID serial ANOTHER" in failed["panels"]["detail"]
     assert "identify" in failed["panels"]["remedy"]
+
+
+def found_in(state: str, folder: Path) -> list[str]:
+    """Findings of this state about monitors that are bound by their connectors."""
+    panels = ", ".join(f'{{ connector = "DUMMY{n}" }}' for n in range(3))
+    (folder / "a.toml").write_text(f"{STACK}[output]\nkind = 'windows'\npanels = [{panels}]")
+    return [row.detail for row in monitors(load_settings(folder / "a.toml")) if row.state == state]
+
+
+@pytest.mark.windows
+def test_the_doctor_finds_a_gamma_set_by_the_x_server(x: XServer, tmp_path: Path) -> None:
+    assert found_in("warn", tmp_path) == []
+    x.xrandr("--output", "DUMMY1", "--gamma", "1:0.8:0.6")
+    (warning,) = found_in("warn", tmp_path)
+    x.xrandr("--output", "DUMMY1", "--gamma", "1:1:1", "--brightness", "1")
+    assert "grey levels of DUMMY1 (gamma, brightness or a night light)" in warning
+    assert found_in("warn", tmp_path) == []
+
+
+@pytest.mark.windows
+def test_the_doctor_refuses_monitors_that_are_mirrored_on_each_other(x: XServer, tmp_path: Path) -> None:
+    x.xrandr("--output", "DUMMY2", "--same-as", "DUMMY1")
+    try:
+        (failure,) = found_in("fail", tmp_path)
+    finally:
+        x.place(0, 1, 2)
+    assert failure.startswith("panels 1 and 2 would show the same pixels")

@@ -14,7 +14,7 @@ from runtime.optics.presentation import Interpolation, panel_draws, shown_layers
 from runtime.panels import processor
 from runtime.records import U8
 from tests.panels import presentation_table as table
-from tests.panels.drawn import DrawnPanels, ProcessorDrawnPanels
+from tests.panels.drawn import DrawnPanels, ProcessorDrawnPanels, ReadPanels
 
 NAMES = pytest.mark.parametrize("name", table.ROWS)
 
@@ -23,7 +23,7 @@ def drawn(name: str, context: moderngl.Context | None) -> U8:
     """(N, h, w, 3) what the shader shows, or without a context the processor."""
     row = table.ROWS[name]
     size_px, panels = (row.stack.width_px, row.stack.height_px), (row.settings,) * row.stack.count
-    sink: DrawnPanels | ProcessorDrawnPanels
+    sink: ReadPanels
     if context is None:
         sink = ProcessorDrawnPanels(clock=SimulatedClock(), size_px=size_px, panels=panels)
     else:

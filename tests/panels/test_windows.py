@@ -200,17 +200,6 @@ def test_a_frame_drawn_early_is_shown_when_it_is_due(opened: Callable[..., Any])
     assert unchanged.present_ns == due_ns and unchanged.held_ns is None
 
 
-@PROCESSOR
-def test_a_registered_panel_is_drawn_on_the_processor_too(opened: Callable[..., Any], x: XServer) -> None:
-    shift = ((1.0, 0.0, 5.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    sink = opened(PanelSettings(connector="DUMMY2", homography=shift), *BY_CONNECTOR[1:])
-    sink.present(frame(7))
-    assert not sink._windows.opengl
-    expected = np.roll(picture(7, 0), 5, axis=1)
-    expected[:, :5] = 0
-    assert shows(x, 2, expected)
-
-
 @pytest.mark.skipif(os.getuid() != 0 or shutil.which("unshare") is None, reason="needs root and unshare")
 def test_without_memory_shared_with_the_x_server_opengl_draws(x: XServer) -> None:
     """As in a container with an IPC namespace of its own."""
