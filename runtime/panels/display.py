@@ -14,6 +14,7 @@ from functools import cache
 from typing import Any
 
 import moderngl
+import numpy as np
 
 from runtime.errors import MissingPart, PanelLost
 from runtime.panels import edid, xlib
@@ -223,7 +224,7 @@ class Display:
                 width_px=mode.size.width,
                 height_px=mode.size.height,
                 refresh_hz=refresh_hz,
-                has_gamma=state is not None and state.has_gamma,
+                has_gamma=_has_gamma(handle),
             )
             pairs.append((monitor, handle))
         return pairs
@@ -236,6 +237,16 @@ class Display:
     def has_windows(self) -> bool:
         """True if any window other than the hidden root window is open."""
         return len(self._windows) > 1
+
+
+def _has_gamma(monitor: Any) -> bool:
+    """Return True if the X server changes grey levels by more than an 8-bit level, as night lights do."""
+    try:
+        ramp = glfw.get_gamma_ramp(monitor)
+    except glfw.GLFWError:  # the driver has no table
+        return False
+    levels = np.array([ramp.red, ramp.green, ramp.blue])
+    return bool(levels.any() and np.abs(levels - np.linspace(0, 1, levels.shape[1])).max() > 1 / 255)
 
 
 def x_display() -> int:

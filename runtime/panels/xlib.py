@@ -12,7 +12,7 @@ import logging
 import os
 import select
 import threading
-from ctypes import POINTER, byref, c_char_p, c_int, c_long, c_ubyte, c_uint, c_ulong, c_ushort, c_void_p
+from ctypes import POINTER, byref, c_char_p, c_int, c_long, c_ubyte, c_uint, c_ulong, c_void_p
 from dataclasses import dataclass
 
 from runtime.panels.monitors import Rectangle
@@ -62,10 +62,6 @@ class _Output(ctypes.Structure):
     _fields_ = (("timestamp", c_ulong), ("crtc", c_ulong))
 
 
-class _Gamma(ctypes.Structure):
-    _fields_ = (("size", c_int), *((name, POINTER(c_ushort)) for name in ("red", "green", "blue")))
-
-
 class _Crtc(ctypes.Structure):
     """First fields of XRRCrtcInfo."""
 
@@ -86,7 +82,6 @@ class OutputState:
     place: Rectangle  # the region of the X screen shown by this output
     refresh_hz: float  # 0 if unknown
     edid: bytes  # empty if the monitor has no EDID
-    has_gamma: bool = False  # True if the server changes grey levels, as night lights do
 
 
 @functools.cache
@@ -106,8 +101,6 @@ def _libraries() -> tuple[ctypes.CDLL, ctypes.CDLL]:
     randr.XRRGetCrtcInfo.restype = POINTER(_Crtc)
     randr.XRRGetCrtcInfo.argtypes = [c_void_p, POINTER(_Resources), c_ulong]
     randr.XRRFreeCrtcInfo.argtypes = [POINTER(_Crtc)]
-    randr.XRRGetCrtcGamma.restype, randr.XRRGetCrtcGamma.argtypes = POINTER(_Gamma), [c_void_p, c_ulong]
-    randr.XRRFreeGamma.argtypes = [POINTER(_Gamma)]
     randr.XRRGetOutputProperty.argtypes = [
         c_void_p, c_ulong, c_ulong, c_long, c_long, c_int, c_int, c_ulong,
         POINTER(c_ulong), POINTER(c_int), POINTER(c_ulong), POINTER(c_ulong), POINTER(POINTER(c_ubyte)),
@@ -202,26 +195,11 @@ def output_state(display: int, output: int) -> OutputState | None:
             Rectangle(place.x, place.y, place.width, place.height),
             refresh_hz.get(place.mode, 0.0),
             _property(x11, randr, display, output, x11.XInternAtom(display, b"EDID", 0)),
-            _has_gamma(randr, display, crtc),
         )
         randr.XRRFreeCrtcInfo(state)
         return output_now
     finally:
         randr.XRRFreeScreenResources(resources)
-
-
-def _has_gamma(randr: ctypes.CDLL, display: int, crtc: int) -> bool:
-    """Return True if a CRTC's gamma table differs from a straight line by more than an 8-bit level."""
-    table = randr.XRRGetCrtcGamma(display, crtc)
-    if not table:
-        return False
-    size, *channels = (getattr(table.contents, name) for name in ("size", "red", "green", "blue"))
-    steps = range(size if size > 1 else 0)
-    straight = [step * 65535 / (size - 1) for step in steps]
-    levels = [channel[step] for channel in channels for step in steps]
-    randr.XRRFreeGamma(table)
-    # Drivers without a table return zeros.
-    return any(levels) and any(abs(level - wanted) > 257 for level, wanted in zip(levels, 3 * straight, strict=True))
 
 
 def _refresh_hz(mode: _Mode) -> float:
