@@ -6,7 +6,6 @@ import fcntl
 import json
 import logging
 import os
-import struct
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -30,9 +29,7 @@ INDEX_SHARE = 1.1  # ratio of a file's size with chunk indices to its size witho
 SUMMARY_BYTES = 10_000  # size of a file's summary, schemas included
 MAX_S, MAX_BYTES = 600.0, 2 << 30  # limits for a recording
 MAGIC = b"\x89MCAP0\r\n"
-RECORD, CHUNK = struct.Struct("<BQ"), b"\x06"  # a record's header, with kind and length; a chunk's kind
-CHUNK_HEAD = struct.Struct("<BQQQQII")  # record header, times, size, checksum, length of the compression's name
-EXPANDED_MOST = 8  # assumed compression ratio of a truncated chunk
+CHUNK = b"\x06"  # first byte of a chunk
 WINDOW_BYTES = 1 << 27  # maximum zstandard window size
 NEEDED = (
     "replay requires it and the topic `/eyes`; to play other recordings, write your own driver (see docs/sensors.md)"
@@ -127,7 +124,7 @@ class RecordingWriter:
 @contextmanager
 def recording_to(path: Path, header: RecordingHeader, *, max_s: float = MAX_S) -> Iterator[RecordingWriter]:
     """Open a writer for a new recording that replaces any older file once the first sample is written.
-    After a crash, the file is readable up to the last complete sample. A recording with pictures can be read only by
+    After a crash, the file is readable up to the last complete chunk. A recording with pictures can be read only by
     the file's owner. Raises InputError if the file cannot be written, or another process is writing it.
     """
     part, file = path.with_name(f".{path.name}.part"), None
@@ -256,36 +253,23 @@ class Recording:
 
 
 def _mcap_records(file: IO[bytes], *, source: Path, max_bytes: int) -> Iterator[Any]:
-    """Yield all records up to the footer, including those inside chunks, of at most `max_bytes` each. If a chunk is cut
-    off by the end of the file, its complete records are yielded before the exception is raised: InputError beyond
-    `max_bytes`, or for damage ValueError or one of mcap's or a decompressor's.
+    """Yield all records up to the footer, including those inside chunks, of at most `max_bytes` each. Raises InputError
+    beyond `max_bytes`, and for damage or a truncated file ValueError or one of mcap's or a decompressor's exceptions.
     """
     from mcap.records import Chunk
     from mcap.stream_reader import StreamReader, breakup_chunk
 
-    end = len(MAGIC)  # end of the last complete record
     indexed = _indexed_chunks(file, max_bytes=max_bytes)
     file.seek(0)
-    try:
-        for record in StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=max_bytes).records:
-            end = file.tell()
-            if isinstance(record, Chunk):
-                data = _unpacked(record, source=source, max_bytes=max_bytes)
-                yield from breakup_chunk(replace(record, compression="", data=data), validate_crc=True)
-            else:
-                yield record
-            # mcap skips unknown records
-            if end in indexed and os.pread(file.fileno(), len(CHUNK), end) != CHUNK:
-                raise ValueError(f"the chunk at byte {end} has no chunk marker")
-    except InputError:
-        raise
-    except Exception:  # errors raised by mcap, lz4 and zstandard
-        file.seek(-len(MAGIC), os.SEEK_END)
-        is_whole = file.read() == MAGIC  # if so, the file is damaged, and its lengths cannot be trusted
-        file.seek(end)
-        if not is_whole and (data := _cut_off_chunk(file.read(max_bytes))):
-            yield from breakup_chunk(Chunk("", data, 0, 0, 0, len(data)))
-        raise
+    for record in StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=max_bytes).records:
+        if isinstance(record, Chunk):
+            data = _unpacked(record, source=source, max_bytes=max_bytes)
+            yield from breakup_chunk(replace(record, compression="", data=data), validate_crc=True)
+        else:
+            yield record
+        # mcap skips unknown records
+        if (end := file.tell()) in indexed and os.pread(file.fileno(), len(CHUNK), end) != CHUNK:
+            raise ValueError(f"the chunk at byte {end} has no chunk marker")
 
 
 def _indexed_chunks(file: IO[bytes], *, max_bytes: int) -> set[int]:
@@ -306,22 +290,6 @@ def _indexed_chunks(file: IO[bytes], *, max_bytes: int) -> set[int]:
         return set()
 
 
-def _cut_off_chunk(data: bytes) -> bytes:
-    """Return the complete records, decompressed, of a chunk cut off by the end of the file, or no bytes."""
-    if data[:1] != CHUNK or RECORD.unpack_from(data.ljust(RECORD.size, b"\0"))[1] <= len(data) - RECORD.size:
-        return b""
-    name = CHUNK_HEAD.unpack_from(data.ljust(CHUNK_HEAD.size, b"\0"))[-1]
-    compression = data[CHUNK_HEAD.size : CHUNK_HEAD.size + name].decode("ascii", "replace")
-    held = _expanded(compression, data[CHUNK_HEAD.size + name + 8 :], room=len(data) * EXPANDED_MOST)
-    place = 0
-    while place + RECORD.size <= len(held):
-        end = place + RECORD.size + RECORD.unpack_from(held, place)[1]
-        if end > len(held):
-            break
-        place = end
-    return held[:place]
-
-
 def _unpacked(chunk: Any, *, source: Path, max_bytes: int) -> bytes:
     """Return a chunk's decompressed records. Raises InputError beyond `max_bytes`, ValueError for a wrong size."""
     declared: int = chunk.uncompressed_size
@@ -336,7 +304,7 @@ def _unpacked(chunk: Any, *, source: Path, max_bytes: int) -> bytes:
 
 
 def _expanded(compression: str, data: bytes, *, room: int) -> bytes:
-    """Decompress `lz4` or `zstd` data, which may be truncated, to at most `room` bytes; return others unchanged."""
+    """Decompress `lz4` or `zstd` data to at most `room` bytes; return others unchanged."""
     if compression == "lz4":
         import lz4.frame
 
