@@ -18,7 +18,7 @@ from runtime.evaluation.refresh_quality import Pictures
 from runtime.records import U8
 from runtime.support.artifacts import OutputFolder, to_json, write_json, write_png, write_text
 from runtime.support.background import MEASURING_NICENESS, set_niceness
-from runtime.support.threads import fresh_threads, parallel_map
+from runtime.support.threads import parallel_map
 
 log = logging.getLogger("phasestack.output")
 
@@ -112,10 +112,8 @@ class RunOutput:
         return self._folder.staging / "light" / str(frame)
 
     def run_is_over(self) -> None:
-        """From now on, wait for a slow disk and write at normal priority, as no refresh can be delayed now."""
+        """From now on, wait for a slow disk, as no refresh can be delayed now."""
         self._every_one = True
-        set_niceness(0, self._writer)
-        fresh_threads()  # replace the solver's and the measurements' threads, which have a low priority
 
     def finish(
         self, summary: dict[str, Any], layers: U8 | None, moment: Moment | None = None, *, unseen: str = ""

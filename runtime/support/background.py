@@ -114,7 +114,7 @@ def before_all_others() -> Iterator[None]:
         set_niceness(before)
 
 
-def set_niceness(niceness: int, thread: threading.Thread | None = None) -> None:
-    """Set the niceness, -20 (first) to 19, of this or another thread and those it starts, if allowed."""
+def set_niceness(niceness: int) -> None:
+    """Set the niceness, -20 (first) to 19, of this thread and those it starts, if allowed."""
     with suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, (thread or threading.current_thread()).native_id or 0, niceness)
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), niceness)

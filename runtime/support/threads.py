@@ -48,11 +48,6 @@ def ahead(items: Iterable[Item], count: int) -> Iterator[Item]:
         yield waiting.popleft()
 
 
-def fresh_threads() -> None:
-    """Make the next `parallel_map` call start new threads, which inherit the caller's niceness."""
-    _pool.cache_clear()
-
-
 def _submitted(pool: ThreadPoolExecutor, work: Callable[[Item], Result], item: Item) -> Future[Result]:
     """Submit a call to the pool, or make it here if the main thread has ended and no pool takes more calls."""
     try:
@@ -72,4 +67,4 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, "parallel-map")
 
 
-os.register_at_fork(after_in_child=fresh_threads)  # a forked process has none of the pool's threads
+os.register_at_fork(after_in_child=_pool.cache_clear)  # a forked process has none of the pool's threads

@@ -7,54 +7,17 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
 
 import cv2
 import pytest
 
-from runtime.support.background import before_all_others, set_niceness
-from runtime.support.threads import fresh_threads, parallel_map
+from runtime.support.background import before_all_others
+from runtime.support.threads import parallel_map
 
 
-@pytest.fixture
-def two_threads() -> Iterator[None]:
-    fresh_threads()
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(2)
-    yield
-    cv2.setNumThreads(before)
-    fresh_threads()
-
-
-def priorities() -> list[int]:
-    """Niceness of the caller and the pool's two threads, which meet."""
-    met = threading.Barrier(3, timeout=60.0)
-
-    def own(_item: int) -> int:
-        met.wait()
-        return os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
-
-    return parallel_map(own, range(3))
-
-
-@pytest.mark.usefixtures("two_threads")
-def test_fresh_threads_have_the_niceness_of_their_caller() -> None:
-    def measure() -> None:
-        set_niceness(19)
-        priorities()
-
-    low = threading.Thread(target=measure)
-    low.start()
-    low.join()
-    own, *pool = priorities()
-    assert pool == [19, 19]
-    fresh_threads()
-    assert priorities() == [own] * 3
-
-
-@pytest.mark.usefixtures("two_threads")
-def test_a_forked_process_starts_threads_of_its_own() -> None:
+def test_a_forked_process_starts_threads_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     """It waited forever for those that only its parent has."""
+    monkeypatch.setattr(cv2, "getNumThreads", lambda: 2)
     assert parallel_map(abs, [-1, -2, -3]) == [1, 2, 3]
     child = os.fork()
     if child == 0:
