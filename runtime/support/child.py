@@ -1,7 +1,8 @@
 """Process untrusted files in a child process with limits on memory and time.
 
 Parsers hold Python's global lock, and even a small file can make a parser use all memory. The child returns arrays in
-shared memory. Progress, log lines and errors are forwarded as if the work ran in this process.
+shared memory. Progress, log lines and errors are forwarded as if the work ran in this process. The functions from
+`started` on also serve `process`.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing, suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -24,12 +25,13 @@ from typing import Any, TypeVar
 from runtime.errors import PASSING, InputError, PhasestackError, TransientError, one_line
 from runtime.support import progress
 from runtime.support.channel import Channel, ChannelClosed
+from runtime.support.crash import written
 from runtime.support.extras import missing_extra
 from runtime.support.untrusted_input import LIMITS, MIB
 
+PR_SET_PDEATHSIG = 1  # constant from Linux's prctl.h
 MEMORY_MAX = 4 << 30  # default memory limit in bytes, enough for a scene that reaches every limit
 LOOK_S = 0.05  # interval between checks for cancellation
-PR_SET_PDEATHSIG = 1  # constant from Linux's prctl.h
 SENT_S = 600.0  # how long a result waits for the parent to read
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1")
 T = TypeVar("T")
@@ -45,21 +47,13 @@ def in_child(
     TransientError if no process can be started.
     """
     memory_bytes = memory_bytes or MEMORY_MAX
-    # Put this copy of phasestack first.
-    python_path = os.pathsep.join([str(Path(__file__).parents[2]), *filter(None, sys.path)])
     with ExitStack() as cleanup:
         try:
             ours, theirs = Channel.pair()
             cleanup.callback(ours.close)
             with closing(theirs):
-                child = subprocess.Popen(
-                    [sys.executable, "-P", "-m", __name__, str(theirs.fileno())],
-                    stdin=subprocess.DEVNULL,
-                    stdout=subprocess.DEVNULL,
-                    stderr=subprocess.DEVNULL,
-                    pass_fds=(theirs.fileno(),),
-                    env=os.environ | ONE_THREAD | {"PYTHONPATH": python_path},
-                )
+                end = theirs.fileno()
+                child = started(__name__, str(end), files=(end,), output=subprocess.DEVNULL, **ONE_THREAD)
         except OSError as error:
             raise TransientError(f"{source}: cannot start a process to read the file: {error.strerror}") from error
         cleanup.enter_context(child)
@@ -88,7 +82,7 @@ def _outcome(channel: Channel, source: str, seconds: float) -> Any:
                 case "refused":
                     raise content[0] from content[1]
                 case "log":
-                    logging.getLogger(content[0]).log(content[1], "%s", content[2])
+                    log_forwarded(content[0])
                 case "progress":
                     step = content[0]
                     progress.tell(*step)
@@ -97,24 +91,11 @@ def _outcome(channel: Channel, source: str, seconds: float) -> Any:
             raise InputError(source, "", f"was not loaded within {seconds:g} s")
 
 
-class _Forwarded(logging.Handler):
-    """Handler that sends the child's log records to the parent process."""
-
-    def __init__(self, channel: Channel) -> None:
-        super().__init__()
-        self._channel = channel
-
-    def emit(self, record: logging.LogRecord) -> None:
-        with suppress(ChannelClosed):
-            self._channel.send(("log", record.name, record.levelno, record.getMessage()), timeout_s=LOOK_S)
-
-
 def main(channel: Channel) -> None:
     """Run the child process: set the limits, do the work and send the result or the error."""
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # end when the parent ends
+    end_with_parent()
     work, args, source, limits, (memory_bytes, seconds) = channel.receive(60.0)[0]
-    for name, limit in limits.items():
-        setattr(LIMITS, name, limit)
+    take_over(limits, lambda record: channel.send(("log", record), timeout_s=LOOK_S))
     processor_s = (os.cpu_count() or 1) * int(seconds) + 10  # in case the parent cannot kill the child
     for kind, most in (
         (resource.RLIMIT_DATA, memory_bytes),
@@ -126,8 +107,6 @@ def main(channel: Channel) -> None:
         resource.setrlimit(kind, (most, most))
     with suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("1000")
-    logging.getLogger().addHandler(_Forwarded(channel))
-    logging.getLogger().setLevel(logging.INFO)
 
     def tell(*step: Any) -> None:
         channel.send(("progress", step))
@@ -139,7 +118,11 @@ def main(channel: Channel) -> None:
     except MemoryError:
         os._exit(1)
     except PhasestackError as error:
-        channel.send(("refused", error, _passing(error)), timeout_s=SENT_S)
+        cause = passing_cause(error)
+        if isinstance(cause, MemoryError):
+            os._exit(1)
+        is_own_limit = cause is not None and cause.errno == errno.ENOMEM
+        channel.send(("refused", error, None if is_own_limit else cause), timeout_s=SENT_S)
     except Exception as error:
         if missing := missing_extra(error):
             channel.send(("refused", missing, None), timeout_s=SENT_S)
@@ -148,14 +131,61 @@ def main(channel: Channel) -> None:
         channel.send(("refused", InputError(source, "", problem), None), timeout_s=SENT_S)
 
 
-def _passing(error: BaseException | None) -> OSError | None:
-    """Return the transient system error that caused a project error, or None. If the cause is a MemoryError, the
-    process has reached its memory limit, so it ends.
-    """
+def started(
+    module: str, argument: str, *, files: Sequence[int], output: int, **variables: str
+) -> subprocess.Popen[bytes]:
+    """Start a module of this copy of phasestack, with inherited file descriptors. Raises OSError."""
+    path = os.pathsep.join([str(Path(__file__).parents[2]), *filter(None, sys.path)])
+    return subprocess.Popen(
+        [sys.executable, "-P", "-m", module, argument],
+        stdin=subprocess.DEVNULL,
+        stdout=output,
+        stderr=output,
+        pass_fds=files,
+        env=os.environ | {"PYTHONPATH": path} | variables,
+    )
+
+
+def end_with_parent() -> None:
+    """Have the kernel end this process when the thread that started it ends."""
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
+def take_over(limits: Mapping[str, Any], send: Callable[[dict[str, Any]], object]) -> None:
+    """Use the parent's limits for untrusted files, and pass log records to `send`, for `log_forwarded` there."""
+    for name, limit in limits.items():
+        setattr(LIMITS, name, limit)
+    logging.getLogger().addHandler(_Forwarded(send))
+    logging.getLogger().setLevel(logging.INFO)
+
+
+class _Forwarded(logging.Handler):
+    def __init__(self, send: Callable[[dict[str, Any]], object]) -> None:
+        super().__init__()
+        self._send = send
+
+    def emit(self, record: logging.LogRecord) -> None:
+        text = record.getMessage()
+        if record.exc_info and record.exc_info[1]:
+            text += f": {written(record.exc_info[1])}"
+        content = {"name": record.name, "levelno": record.levelno, "levelname": record.levelname, "msg": text}
+        with suppress(ChannelClosed):
+            self._send(content | {"always": getattr(record, "always", False)})
+
+
+def log_forwarded(content: dict[str, Any]) -> None:
+    """Log a record that another process has passed on."""
+    logger = logging.getLogger(content["name"])
+    if logger.isEnabledFor(content["levelno"]):
+        logger.handle(logging.makeLogRecord(content))
+
+
+def passing_cause(error: BaseException | None) -> OSError | MemoryError | None:
+    """Return the shortage that has caused an error, without its trace, or None if it has another cause."""
     while error is not None:
         if isinstance(error, MemoryError):
-            os._exit(1)
-        if isinstance(error, OSError) and error.errno in PASSING - {errno.ENOMEM}:
+            return MemoryError()
+        if isinstance(error, OSError) and error.errno in PASSING:
             return OSError(error.errno, error.strerror)
         error = error.__cause__ or error.__context__
     return None

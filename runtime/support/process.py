@@ -8,7 +8,6 @@ and started again, and the parent only learns why.
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import faulthandler
 import json
 import logging
@@ -18,7 +17,6 @@ import pickle
 import resource
 import select
 import signal
-import subprocess
 import sys
 import threading
 import time
@@ -29,15 +27,15 @@ from pathlib import Path
 from typing import Any
 
 from runtime.clock import NS_PER_S
-from runtime.errors import PASSING, FatalError, PhasestackError, TransientError, one_line
+from runtime.errors import FatalError, PhasestackError, TransientError, one_line
 from runtime.support.background import begin, patience_s
 from runtime.support.channel import Channel, ChannelClosed, shared_memory
+from runtime.support.child import end_with_parent, log_forwarded, passing_cause, started, take_over
 from runtime.support.crash import report_of, written
 from runtime.support.untrusted_input import LIMITS, MIB
 
 log = logging.getLogger("phasestack.processes")
 
-PR_SET_PDEATHSIG = 1  # constant from Linux's prctl.h
 LOOK_S = 0.1  # interval for checking a worker's time limit and memory
 STOPPED_S = 1.0  # if this process was stopped for longer, its workers get time to catch up
 WELL_S = 1.0  # a worker that was ready for longer was well, so the next one is started without a delay
@@ -92,14 +90,9 @@ class _Life:
             self.words = memoryview(mmap.mmap(words, mmap.PAGESIZE)).cast("q")
             self.words[DEADLINE] = time.monotonic_ns() + round(role.start_s * NS_PER_S)
             inherited = (channel.fileno(), notes.fileno(), words, self._trace)
-            self.process = subprocess.Popen(
-                [sys.executable, "-P", "-m", __name__, json.dumps([os.getpid(), *inherited])],
-                stdin=subprocess.DEVNULL,
-                stdout=2,  # this process's own output may be read by a program
-                pass_fds=(*inherited, *files),
-                env=os.environ
-                | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[2]), *filter(None, sys.path)])},
-            )
+            argument = json.dumps([os.getpid(), *inherited])
+            # This process's own output may be read by a program.
+            self.process = started(__name__, argument, files=(*inherited, *files), output=2)
             undo.callback(self.process.kill)
             self.descriptor = os.pidfd_open(self.process.pid)
             with contextlib.suppress(ChannelClosed):  # it has already ended
@@ -296,9 +289,7 @@ class Worker:
             return False
         for kind, content in notes:
             if kind == "log":
-                logger = logging.getLogger(content["name"])
-                if logger.isEnabledFor(content["levelno"]):
-                    logger.handle(logging.makeLogRecord(content))
+                log_forwarded(content)
             else:
                 life.error, cause = content
                 life.error.__cause__ = cause
@@ -392,27 +383,11 @@ class Parent:
         return self._sent - self._words[READ]
 
 
-class _Forwarded(logging.Handler):
-    """Handler that passes a worker's log records on to its parent. If the parent reads too slowly, it drops them."""
-
-    def __init__(self, notes: Channel) -> None:
-        super().__init__()
-        self._notes = notes
-
-    def emit(self, record: logging.LogRecord) -> None:
-        text = record.getMessage()
-        if record.exc_info and record.exc_info[1]:
-            text += f": {written(record.exc_info[1])}"
-        content = {"name": record.name, "levelno": record.levelno, "levelname": record.levelname, "msg": text}
-        with contextlib.suppress(ChannelClosed):
-            self._notes.send(("log", content | {"always": getattr(record, "always", False)}))
-
-
 def main(parent: int, channel: int, notes: int, words: int, trace: int) -> int:
     """Run a worker's process, and return its exit status. Arguments: the parent's number, and descriptors
     of the channel, of log lines and errors, of words shared with the parent, and for the stacks left by a crash.
     """
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # end when the parent ends
+    end_with_parent()
     if os.getppid() != parent:  # it has ended already
         return 1
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # sent to the whole group; the parent decides
@@ -427,10 +402,7 @@ def main(parent: int, channel: int, notes: int, words: int, trace: int) -> int:
         return 1
     role, arguments, limits = first
     _limit(role)
-    for name, limit in limits.items():
-        setattr(LIMITS, name, limit)
-    logging.getLogger().addHandler(_Forwarded(notes_to_parent))
-    logging.getLogger().setLevel(logging.INFO)
+    take_over(limits, lambda record: notes_to_parent.send(("log", record)))  # if the parent reads slowly, drop it
     try:
         role.main(Parent(link, shared), *arguments)
     except ChannelClosed:
@@ -456,17 +428,12 @@ def _limit(role: Role) -> None:
 
 def _say_why(notes: Channel, error: BaseException) -> None:
     """Report the error that ends this process to the parent. An unexpected one is also written to a file."""
-    cause: BaseException | None = error
-    while cause is not None and not (
-        isinstance(cause, MemoryError) or (isinstance(cause, OSError) and cause.errno in PASSING)
-    ):
-        cause = cause.__cause__ or cause.__context__
-    passing = OSError(cause.errno, cause.strerror) if isinstance(cause, OSError) else MemoryError() if cause else None
+    cause = passing_cause(error)
     if not isinstance(error, PhasestackError | SystemExit | MemoryError):
         error = FatalError(written(error))
     error = error.with_traceback(None)
     with contextlib.suppress(ChannelClosed, TypeError, AttributeError, pickle.PicklingError):
-        notes.send(("failed", (error, passing)), timeout_s=1.0)
+        notes.send(("failed", (error, cause)), timeout_s=1.0)
 
 
 if __name__ == "__main__":
