@@ -152,7 +152,7 @@ def end_with_parent() -> None:
 
 
 def take_over(limits: Mapping[str, Any], send: Callable[[dict[str, Any]], object]) -> None:
-    """Use the parent's limits for untrusted files, and pass log records to `send`, for `log_forwarded` there."""
+    """Use the parent's limits for untrusted files, and pass log records to `send` (`log_forwarded`)."""
     for name, limit in limits.items():
         setattr(LIMITS, name, limit)
     logging.getLogger().addHandler(_Forwarded(send))
