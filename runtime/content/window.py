@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from ctypes import POINTER, Structure, c_char_p, c_int, c_int16, c_uint, c_uint8, c_uint16, c_uint32, c_void_p
 from dataclasses import dataclass
 from functools import partial
@@ -32,18 +32,22 @@ CLICK_S = 0.02  # how often the mouse button is looked at while the user chooses
 LOOKED_UP_WITHIN_S = 3.0  # time limit for the list of windows, and for a virtual screen's start
 OURS = "phasestack"  # class and title of our own panels
 BUTTON = 1 << 8  # bit of the first mouse button
+AUTOMATIC = 0  # a redirected window is still shown
+INNER = 0.4  # a titled child window that fills this share of its parent is shown without what surrounds it
 WINDOW = re.compile(  # a line of `xwininfo -root -tree`
-    r'^\s*(?P<id>0x[0-9a-f]+) (?P<name>".*"|\(has no name\)): \((?P<kind>.*)\)\s+(?P<w>\d+)x(?P<h>\d+)\S+'
+    r'^(?P<indent>\s*)(?P<id>0x[0-9a-f]+) (?P<name>".*"|\(has no name\)): \((?P<kind>.*)\)\s+(?P<w>\d+)x(?P<h>\d+)\S+'
     r"\s+(?P<x>[+-]-?\d+)(?P<y>[+-]-?\d+)\s*$"
 )
 
 
 class WindowOptions(Section):
-    """Options for the scene `window`: one of `title`, `pick`, `region` and `command`."""
+    """Options for the scene `window`: one of `title`, `pick` and `command`, or only `region`."""
 
     title: str = Field("", description="part of the window's title or class")
     pick: bool = Field(False, description="show the window on which the user clicks next")
-    region: tuple[int, int, int, int] | None = Field(None, description="part of the screen: left, top, width, height")
+    region: tuple[int, int, int, int] | None = Field(
+        None, description="part of the window, or of the screen: left, top, width, height"
+    )
     command: tuple[str, ...] = Field((), description="program to start on a virtual screen, with its arguments")
     size_px: tuple[int, int] = Field((1920, 1080), description="size of the virtual screen")
     display: str = Field("", description="X server, by default $DISPLAY")
@@ -52,7 +56,8 @@ class WindowOptions(Section):
 
     @model_validator(mode="after")
     def _one(self) -> WindowOptions:
-        if bool(self.title) + self.pick + (self.region is not None) + bool(self.command) != 1:
+        sources = bool(self.title) + self.pick + bool(self.command)
+        if sources > 1 or (sources == 0 and self.region is None):
             raise ValueError("set one of title, pick, region and command, such as { title = 'sView' }")
         if self.region is not None and (min(self.region[:2]) < 0 or min(self.region[2:]) < 2):
             raise ValueError("region: must be left, top, width, height, with a size of at least 2 pixels")
@@ -70,6 +75,8 @@ class Place:
     width: int
     height: int
     window: int = 0  # number of the window that is there, or 0 for a part of the screen
+    left: int = 0  # first column and row of the window that is shown
+    top: int = 0
 
 
 def prepare(file: SceneFile) -> Callable[..., ContentSource]:
@@ -90,19 +97,30 @@ def _source(options: WindowOptions, file: SceneFile, context: Any = None) -> Con
 
 def place_of(title: str | int, listed: str) -> Place | None:
     """Return the place of the window with a number, or of the largest one whose title or class contains a
-    text, in any case. None if there is none but our panels. `listed` is what `xwininfo -root -tree` prints.
+    text, in any case, and of the drawing area in it if that is a titled window of its own. None if there is none but
+    our panels. `listed` is what `xwininfo -root -tree` prints.
     """
-    found = []
-    for line in listed.splitlines():
-        match = WINDOW.match(line)
-        if match is None:
-            continue
+    windows = [match for line in listed.splitlines() if (match := WINDOW.match(line)) and f'"{OURS}' not in line]
+
+    def is_meant(match: re.Match[str]) -> bool:
         names = f"{match['name']} {match['kind']}".lower()
-        is_meant = title.lower() in names if isinstance(title, str) else int(match["id"], 16) == title
-        if is_meant and f'"{OURS}' not in names:
-            x, y = (int(match[axis].replace("+-", "-").lstrip("+")) for axis in "xy")
-            found.append(Place(x, y, int(match["w"]), int(match["h"]), int(match["id"], 16)))
-    return max(found, key=lambda place: place.width * place.height, default=None)
+        return title.lower() in names if isinstance(title, str) else int(match["id"], 16) == title
+
+    def area(match: re.Match[str]) -> int:
+        return int(match["w"]) * int(match["h"])
+
+    found = max(filter(is_meant, windows), key=area, default=None)
+    if found is None:
+        return None
+    outer = found
+    for match in windows[windows.index(outer) + 1 :]:  # a parent's children follow it
+        if len(match["indent"]) <= len(outer["indent"]):
+            break
+        is_titled = match["name"].startswith('"')
+        if is_titled and len(match["indent"]) > len(found["indent"]) and area(match) >= INNER * area(found):
+            found = match
+    x, y = (int(found[axis].replace("+-", "-").lstrip("+")) for axis in "xy")
+    return Place(x, y, int(found["w"]), int(found["h"]), int(found["id"], 16))
 
 
 class WindowFeed(Feed):
@@ -127,17 +145,19 @@ class WindowFeed(Feed):
                         self._capture(display, place, process)
                     if process is not None and process.poll() is not None:
                         self.problem = f"{self.name}: ended with exit status {process.returncode}"
-            except (OSError, ValueError, subprocess.SubprocessError, av.error.FFmpegError) as error:
+            except av.error.FFmpegError as error:  # of which "permission denied" is a window that is not mapped
+                is_part = self._options.region is not None
+                why = "is smaller than the region, or hidden" if is_part else "is hidden, or was closed or resized"
+                self.problem = f"{self.name}: {why} ({error.strerror})"
+            except (OSError, ValueError, subprocess.SubprocessError) as error:
                 self.problem = one_line(f"{self.name}: {getattr(error, 'strerror', None) or error}")
             self._ends.wait(AGAIN_S)
 
     def _place(self, display: str) -> Place | None:
-        """Return the window's place, or None for the whole screen. Raises ValueError for an unknown window."""
+        """Return what to show, or None for the whole screen. Raises ValueError for an unknown window."""
         options = self._options
-        if options.region is not None:
-            return Place(*options.region)
         if not options.title and not options.pick:
-            return None
+            return Place(*options.region) if options.region is not None else None
         if options.pick and not self._picked:
             self._picked = self._clicked(display)
         command = ["xwininfo", "-display", display, "-root", "-tree"]
@@ -148,7 +168,10 @@ class WindowFeed(Feed):
         if place is None:
             self._picked = 0
             raise ValueError("no window has this title or class" if options.title else "the window cannot be shown")
-        return place
+        if options.region is None:
+            return place
+        left, top, width, height = options.region
+        return Place(place.x + left, place.y + top, width, height, place.window, left, top)
 
     def _clicked(self, display: str) -> int:
         """Wait for a click, and return the number of the window there. Raises ValueError if there is none."""
@@ -172,11 +195,15 @@ class WindowFeed(Feed):
         if place is not None:
             given["video_size"] = f"{place.width}x{place.height}"
             if place.window:  # captured where it is, so that nothing else is shown if it is moved or closed
-                given["window_id"] = str(place.window)
+                given |= {"window_id": str(place.window), "grab_x": str(place.left), "grab_y": str(place.top)}
             else:
                 source = f"{display}+{place.x},{place.y}"
         looked_s, last, last_pointer = time.monotonic(), np.empty((0, 0, 3), np.uint8), None
-        with closing(XPointer(display)) as mouse, av.open(source, format="x11grab", options=given) as container:
+        with ExitStack() as stack:
+            mouse = stack.enter_context(closing(XPointer(display)))
+            if place is not None and place.window:
+                mouse.keep_covered(place.window)
+            container = stack.enter_context(av.open(source, format="x11grab", options=given))
             for frame in container.decode(video=0):
                 rgb: U8 = np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
                 self._seen_s = time.monotonic()
@@ -232,7 +259,7 @@ def pointer_in(now: Pointed | None, place: Place | None, size_px: tuple[int, ...
     return (u, v) if 0 <= u < 1 and 0 <= v < 1 else None
 
 
-# The mouse pointer is read through libxcb, because libX11 ends the process if the X server ends.
+# libxcb is used, because libX11 ends the process if the X server ends.
 
 
 class _Screens(Structure):
@@ -256,7 +283,7 @@ class Pointed(Structure):
 
 
 class XPointer:
-    """Connection to an X server that reads its pointer."""
+    """Connection to an X server that reads its pointer, and keeps covered windows."""
 
     def __init__(self, display: str) -> None:
         """Connect. Raises OSError if libxcb is missing or the server cannot be reached."""
@@ -289,6 +316,16 @@ class XPointer:
         found = Pointed.from_buffer_copy(reply.contents)
         self._free(reply)
         return found if found.same_screen else None
+
+    def keep_covered(self, window: int) -> None:
+        """Have the server keep a window's picture where others cover it, until `close`. Has no effect without
+        libxcb-composite.
+        """
+        with suppress(OSError):
+            redirect = ctypes.CDLL("libxcb-composite.so.0").xcb_composite_redirect_window
+            redirect.restype, redirect.argtypes = _Cookie, [c_void_p, c_uint32, c_uint8]
+            redirect(self._connection, window, AUTOMATIC)
+            self.now()  # waits until the server has done so
 
     def close(self) -> None:
         """Close the connection. Has no effect if it is closed."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -77,6 +78,18 @@ def test_each_eye_sees_its_half_of_the_newest_picture(fifo: Path, colours: str) 
         writer.flush()
         assert eventually(lambda: shows(source, 130, is_full=colours in ("mono", "420 XCOLORRANGE=FULL")))
         assert source.problem == "" and source.revision(time_ns=0) == 3
+    source.close()
+
+
+@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs FFmpeg")
+def test_ffmpeg_writes_to_a_pipe_and_is_started_again() -> None:
+    halves = "color=gray:s=32x36,format=gray,geq=lum=60[l];color=gray:s=32x36,format=gray,geq=lum=80[r];[l][r]hstack"
+    command = ["ffmpeg", "-v", "error", "-re", "-f", "lavfi", "-i", halves, "-pix_fmt", "gray", "-t", "0.4"]
+    source = opened(command=[*command, "-f", "yuv4mpegpipe", "-strict", "-1", "-"])
+    assert eventually(lambda: shows(source, 60, is_full=True) and source.problem == "")
+    assert eventually(lambda: source.problem.endswith("ffmpeg: closed"))
+    before = source.revision(time_ns=0)
+    assert eventually(lambda: source.revision(time_ns=0) > before and source.problem == "")
     source.close()
 
 

@@ -8,11 +8,14 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
+from ctypes.util import find_library
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -20,6 +23,7 @@ from runtime.config import ContentSettings, StackGeometry
 from runtime.content.registry import open_content
 from runtime.content.window import Place, place_of
 from runtime.errors import ContentFailure, InputError
+from runtime.optics.stack import PanelStack
 from runtime.plan.drawing import raster_views
 from tests.waiting import eventually
 
@@ -41,6 +45,13 @@ xwininfo: Window id: 0x50e (the root window) (has no name)
         0x20000a (has no name): ()  640x360+0+0  +20+-30
      0x400009 "phasestack 1": ("phasestack" "phasestack")  1920x1080+0+0  +0+0
      0x600001 "player": ("tiny" "Tiny")  1x1+-1+-1  +-1+-1
+     0x700001 (has no name): ()  1290x430+0+0  +0+0
+        1 child:
+        0x70000a "PyMOL": ("PyMOL" "PyMOL")  1280x400+5+25  +5+25
+           3 children:
+           0x700013 "PyMOL": ("PyMOL" "PyMOL")  1280x22+0+0  +5+25
+           0x700006 "PyMOL": ("PyMOL" "PyMOL")  1280x378+0+22  +5+47
+           0x70000c "PyMOL": ("PyMOL" "PyMOL")  100x30+0+0  +5+25
 """
 
 needs_x = pytest.mark.skipif(
@@ -137,16 +148,10 @@ def mouse(display: str, *action: str) -> None:
     assert eventually(lambda: subprocess.run(["xdotool", *action], env=environment).returncode == 0)
 
 
-def pair_of(source: Any) -> list[np.ndarray]:
-    views = raster_views(EYES, LARGE.panel(1))
-    source.expect(views, time_ns=0)
-    return [source.render(view, time_ns=0)[..., :3].min(2).astype(int) for view in views]
-
-
 def tips(source: Any) -> list[list[float]]:
     """Place of the arrow's tip in each view that shows it, as fractions of its width and height."""
     try:
-        pictures = pair_of(source)
+        pictures = [picture.min(2).astype(int) for picture in views_of(source, LARGE)]
     except ContentFailure:
         return []
     rows_columns = [np.argwhere(picture > 60)[0] for picture in pictures if (picture > 60).any()]
@@ -192,10 +197,114 @@ def test_a_window_is_picked_by_a_click(display: str) -> None:
     source.close()
 
 
+def in_window(display: str, title: str, action: str) -> None:
+    subprocess.run(["xdotool", "search", "--name", title, action], env=os.environ | {"DISPLAY": display}, check=True)
+
+
+@needs_x
+@needs_a_mouse
+def test_a_hidden_window_is_told_and_comes_back(display: str) -> None:
+    shown = window(display, "stereo", "160x90+0+0", "#ff0000", "#0000ff")
+    source = opened(title="stereo", display=display)
+    assert eventually(lambda: shows(source, (255, 0, 0), (0, 0, 255)))
+    in_window(display, "stereo", "windowunmap")
+    assert eventually(lambda: "stereo: is hidden" in source.problem)
+    in_window(display, "stereo", "windowmap")
+    assert eventually(lambda: source.problem == "")
+    shown.kill()
+    shown.wait()
+    source.close()
+
+
+@needs_x
+@pytest.mark.skipif(find_library("xcb-composite") is None, reason="needs libxcb-composite")
+def test_a_covered_window_is_shown_and_a_part_of_it(display: str) -> None:
+    under = window(display, "under", "160x90+40+30", "#ff0000", "#0000ff")
+    source = opened(title="under", region=(40, 10, 80, 60), display=display)
+    assert eventually(lambda: shows(source, (255, 0, 0), (0, 0, 255)))
+    source.close()
+    over = window(display, "over", "400x300+0+0", "#808080", "#808080")
+    screen = opened(region=(0, 0, 400, 300), display=display)
+    assert eventually(lambda: shows(screen, (128,) * 3, (128,) * 3))
+    screen.close()
+    source = opened(title="under", region=(40, 10, 80, 60), display=display)
+    assert eventually(lambda: shows(source, (255, 0, 0), (0, 0, 255)))
+    for one in (under, over):
+        one.kill()
+        one.wait()
+    source.close()
+
+
+def views_of(source: Any, stack: PanelStack) -> list[np.ndarray]:
+    views = raster_views(EYES, stack.panel(1))
+    source.expect(views, time_ns=0)
+    return [source.render(view, time_ns=0)[..., :3].copy() for view in views]
+
+
+@pytest.mark.skipif(shutil.which("Xvfb") is None or shutil.which("mpv") is None, reason="needs Xvfb and mpv")
+@pytest.mark.parametrize("layout", ["side-by-side", "top-bottom"])
+def test_mpv_shows_each_eye_its_half_to_the_pixel(tmp_path: Path, layout: str) -> None:
+    picture = np.random.default_rng(0).integers(0, 256, (96, 160, 3), np.uint8)
+    cv2.imwrite(str(tmp_path / "picture.png"), picture[..., ::-1])
+    halves = np.split(picture, 2, axis=1 if layout == "side-by-side" else 0)
+    height, width = halves[0].shape[:2]
+    stack = replace(STACK, width_px=width, height_px=height, width_m=width / 400, height_m=height / 400)
+    command = ["mpv", "--no-config", "--vo=x11", "--no-osc", "--really-quiet", "--fs", "--image-display-duration=inf"]
+    options = {"command": [*command, str(tmp_path / "picture.png")], "size_px": (160, 96), "pointer": False}
+    source = open_content(ContentSettings(scene="window", layout=layout, options=options), stack, None)
+
+    def is_exact() -> bool:
+        with suppress(ContentFailure):
+            return np.array_equal(views_of(source, stack), halves)
+        return False
+
+    assert eventually(is_exact) and source.problem == ""
+    source.close()
+
+
+@needs_x
+@pytest.mark.skipif(shutil.which("pymol") is None, reason="needs PyMOL")
+def test_pymol_shows_near_atoms_in_front_and_no_menu(display: str, tmp_path: Path) -> None:
+    (tmp_path / "atoms.pml").write_text(
+        "pseudoatom near, pos=[0, 5, 10], color=red\npseudoatom far, pos=[0, -5, -10], color=blue\nshow spheres\n"
+        "bg_color white\nset depth_cue, 0\nset internal_feedback, 0\nstereo sidebyside\nreset\n"
+    )
+    command = ["pymol", "-q", "-x", "-i", "-W", "380", "-H", "200", str(tmp_path / "atoms.pml")]
+    environment = os.environ | {"DISPLAY": display, "PATH": "/usr/bin:/bin"}  # Debian's script runs Debian's Python
+    pymol = subprocess.Popen(command, env=environment, start_new_session=True)
+    source = opened(title="pymol", display=display, pointer=False)
+
+    def offsets() -> list[float]:
+        """How far each ball is to the right in the left eye's view, in pixels."""
+        try:
+            pair = [picture.astype(int) for picture in views_of(source, LARGE)]
+        except ContentFailure:
+            return []
+        places = [
+            [np.argwhere(eye[..., own] - eye[..., other] > 60)[:, 1] for eye in pair] for own, other in ((0, 2), (2, 0))
+        ]
+        return [left.mean() - right.mean() for left, right in places if len(left) and len(right)]
+
+    try:
+        assert eventually(lambda: len(offsets()) == 2)
+        near, far = offsets()
+        assert near > 0.5 and far < -0.5
+        assert views_of(source, LARGE)[0][4:16, 100:156].min() == 255  # no menu, which is grey with black letters
+    finally:
+        source.close()
+        os.killpg(pymol.pid, signal.SIGKILL)
+        pymol.wait()
+
+
 def test_the_largest_window_with_the_title_or_class_is_found() -> None:
     assert place_of("PLAYER", LISTED) == Place(20, -30, 640, 360, 0x200009)
     assert place_of("Tiny", LISTED) == Place(-1, -1, 1, 1, 0x600001)
     assert place_of("nothing", LISTED) is None
+
+
+@pytest.mark.parametrize("window", ["pymol", 0x70000A, 0x700001])
+def test_menus_and_frames_around_the_drawing_area_are_left_out(window: str | int) -> None:
+    assert place_of(window, LISTED) == Place(5, 47, 1280, 378, 0x700006)
 
 
 @needs_x
@@ -218,7 +327,7 @@ def test_our_own_panels_are_never_found(display: str) -> None:
     ("options", "why"),
     [
         ({}, "set one of title, pick, region and command"),
-        ({"title": "a", "region": (0, 0, 10, 10)}, "set one of title, pick, region and command"),
+        ({"title": "a", "pick": True}, "set one of title, pick, region and command"),
         ({"region": (0, 0, 0, 10)}, "region: must be left, top, width, height"),
     ],
 )
