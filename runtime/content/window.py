@@ -33,7 +33,7 @@ LOOKED_UP_WITHIN_S = 3.0  # time limit for the list of windows, and for a virtua
 OURS = "phasestack"  # class and title of our own panels
 BUTTON = 1 << 8  # bit of the first mouse button
 AUTOMATIC = 0  # a redirected window is still shown
-INNER = 0.4  # a titled child window that fills this share of its parent is shown without what surrounds it
+INNER = 0.4  # a titled child window that fills this share of its parent is shown instead of it
 WINDOW = re.compile(  # a line of `xwininfo -root -tree`
     r'^(?P<indent>\s*)(?P<id>0x[0-9a-f]+) (?P<name>".*"|\(has no name\)): \((?P<kind>.*)\)\s+(?P<w>\d+)x(?P<h>\d+)\S+'
     r"\s+(?P<x>[+-]-?\d+)(?P<y>[+-]-?\d+)\s*$"
@@ -97,7 +97,7 @@ def _source(options: WindowOptions, file: SceneFile, context: Any = None) -> Con
 
 def place_of(title: str | int, listed: str) -> Place | None:
     """Return the place of the window with a number, or of the largest one whose title or class contains a
-    text, in any case, and of the drawing area in it if that is a titled window of its own. None if there is none but
+    text, in any case, or of the drawing area in it if that is a titled child window. None if there is none but
     our panels. `listed` is what `xwininfo -root -tree` prints.
     """
     windows = [match for line in listed.splitlines() if (match := WINDOW.match(line)) and f'"{OURS}' not in line]
