@@ -21,10 +21,7 @@ NAMED = 8  # maximum number of pairs named in a message
 
 
 def check_pairs(pairs: Pairs) -> list[str]:
-    """Check pairs before they are used to compute a calibration, and return warnings. Raises InputError
-    if there are fewer than 3 pairs, the points are coincident or collinear, double precision is insufficient for them,
-    an axis is mirrored, or the points in one frame are in millimetres.
-    """
+    """Check pairs before they are used to compute a calibration, and return warnings. Raises InputError."""
     if _is_mirrored(pairs):
         raise InputError(
             pairs.source,
@@ -49,8 +46,7 @@ def check_pairs(pairs: Pairs) -> list[str]:
 
 def check_solution(pairs: Pairs, solution: CalibrationSolution, volume_m: F64) -> list[str]:
     """Check a solution for viewers in a volume spanned by points (..., 3) in `stack`, and return
-    warnings. Raises InputError if the matrix is implausible, or the residuals or the expected error at the eye are too
-    large.
+    warnings. Raises InputError.
     """
     warnings = []
     check_similarity(solution.similarity.matrix, source=pairs.source)

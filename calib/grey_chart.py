@@ -124,8 +124,7 @@ def lut_from_photographs(
     turns: AngleRange | None = None,
 ) -> dict[str, Any]:
     """Measure a panel's grey curve from photographs (names and grey pixels) of its chart, and write the
-    LUT as CSV. `turns` are the panel's angles at black and full white, by default 0 and 90 degrees. Raises InputError,
-    which names the `source`, if a photograph is unusable, or the measured greys do not increase.
+    LUT as CSV. `turns` are the panel's angles at black and full white, by default 0 and 90 degrees. Raises InputError.
     """
     measured = [histograms(picture, stack, panel, source=f"{source}, {name}") for name, picture in pictures]
     intensity, residual = measure(measured, stack, panel, source=source)
@@ -149,8 +148,7 @@ def write_lut(out: Path, intensity: F64, turns: AngleRange) -> None:
 
 def histograms(picture: U8, stack: PanelStack, panel: int, *, source: str) -> F64:
     """Return a histogram of the pixels in the middle of each patch (P, 256) of a grey photograph of a
-    panel's chart. Raises InputError, which names the `source`, if it is too dark or overexposed, or does not show the
-    entire chart.
+    panel's chart. Raises InputError.
     """
     seen = find_marks(picture, stack, name="")
     mine, marks_seen = seen.panel == panel, seen.marks[panel]
@@ -185,8 +183,7 @@ def measure(pictures: list[F64], stack: PanelStack, panel: int, *, source: str) 
 
     The fit determines the camera's tone curve, the uneven illumination in each photograph (its logarithm is modelled as
     a quadratic polynomial in position) and the intensities. Also return the median of the absolute residuals, each
-    divided by its patch's intensity (plus 0.02). Raises InputError if the intensities do not increase from grey to
-    grey.
+    divided by its patch's intensity (plus 0.02). Raises InputError.
     """
     chart = patches(stack, panel)
     place = np.array([[p.left_px / stack.width_px - 0.5, p.top_px / stack.height_px - 0.5] for p in chart])

@@ -104,9 +104,7 @@ class SetupHardware:
         return photographs(folder)
 
     def open_sensor(self, settings: Settings) -> str:
-        """Start the sensor, wait until it works, and return its name and serial number. Raises InputError if
-        the driver is unknown, it does not work in time, or it delivers eyes in the stack frame.
-        """
+        """Start the sensor, wait until it works, and return its name and serial number. Raises InputError."""
         self._stop_sensor()
         make_driver = partial(open_sensor, settings.sensor, self._clock)
         worker = SensorProcess(SensorSetup(make_driver, settings.sensor, self._clock, partial(EyeFinder, settings)))

@@ -83,8 +83,7 @@ class Pairs:
 
 def read_pairs(path: Path) -> Pairs:
     """Read pairs from a CSV file whose header contains `COLUMNS`, or from a JSON list or `{"pairs":
-    [...]}`. Raises InputError, which names rows and columns, if the file cannot be read, has too many pairs or pairs
-    from different sensors, or contains invalid values.
+    [...]}`. Raises InputError.
     """
     labels, rows = _read_rows(path)
     if len(rows) > MAX_PAIRS:

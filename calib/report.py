@@ -48,8 +48,7 @@ class Points(NamedTuple):
 
 def write_report(file: Path, out: Path, *, viewing: CalibrationSettings) -> dict[str, Any]:
     """Write a page about a calibration, with its plots as PNG files and its figures in `report.json`, and
-    return these. The error at the eye is averaged over the `viewing` range. Raises InputError for an invalid file, or
-    if it cannot write.
+    return these. The error at the eye is averaged over the `viewing` range. Raises InputError.
     """
     calibration, table = load_calibration(file), read_table(file)
     points = _stored_points(table.get("data"), calibration, source=file)

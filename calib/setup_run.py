@@ -40,8 +40,7 @@ def run_setup(
     config: Path, *, out: Path, photos: Path, simulate: bool, seed: int, to_stderr: bool
 ) -> tuple[dict[str, Any], str]:
     """Create or change a configuration interactively, and return the summary as a dictionary and as text.
-    Reports and the configuration's files go to `out`, the user's photographs to `photos`. Raises InputError if the
-    configuration file or the progress file is invalid.
+    Reports and the configuration's files go to `out`, the user's photographs to `photos`. Raises InputError.
     """
 
     def say(text: str) -> None:

@@ -227,8 +227,7 @@ def _best_half(sensor_m: F64, stack_m: F64, *, random: np.random.Generator) -> N
 
 def fit_robust(sensor_m: F64, stack_m: F64) -> RobustFit:
     """Fit a similarity, deterministically, to those of K >= 3 points (K, 3) in `sensor` and `stack` that
-    agree. Five pairs or fewer have no clear majority, so all of them are used. Raises Degenerate as
-    `similarity.fit`.
+    agree. Five pairs or fewer have no clear majority, so all of them are used. Raises Degenerate as `similarity.fit`.
     """
     count = len(sensor_m)
     everything = fit(sensor_m, stack_m, rule=RULE)

@@ -112,9 +112,7 @@ for _name, _meaning in PLAIN.items():
 
 
 def tell(request: dict[str, Any], config: Path | None) -> None:
-    """Send a request and print the new state. Exits with 1 without a daemon. Raises InputError if
-    refused.
-    """
+    """Send a request and print the new state. Exits with 1 without a daemon. Raises InputError."""
     from runtime.daemon.client import ANSWERED_WITHIN_S, NotRunning, ask, sockets
     from runtime.errors import InputError
     from runtime.support.figures import lines_of

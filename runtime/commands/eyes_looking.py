@@ -48,17 +48,13 @@ class Watcher:
         begin = time.perf_counter()
         people = frame.people if frame.colour is None else self._finder.find_all(frame, is_still=number is None)
         ms = 1e3 * (time.perf_counter() - begin)
-        pupils, reason, points = self._finder.pupils, self._finder.reason, self._finder.points
-        if pupils is not None and frame.intrinsics is None:
-            reason = ""  # distances cannot be measured without intrinsics
-        others = self._finder.others_pupils
+        pupils, others, points = self._finder.pupils, self._finder.others_pupils, self._finder.points
+        reason = self._finder.reason
         if frame.colour is None:
-            pupils, others, points, reason = (
-                None,
-                [],
-                frame.eyes,
-                "this sensor delivers eye positions but no pictures" if people else "this sample contains no eyes",
-            )
+            pupils, others, points = None, [], frame.eyes
+            reason = "this sensor delivers eye positions but no pictures" if people else "this sample contains no eyes"
+        elif pupils is not None and frame.intrinsics is None:
+            reason = ""  # distances cannot be measured without intrinsics
         row = {
             "file": file,
             "frame": number,

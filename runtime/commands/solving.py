@@ -182,8 +182,7 @@ def solve_pictures(
 
 def taken(pictures: list[Any], eyes: Eyes, stack: PanelStack) -> tuple[list[Any], F64, float]:
     """Return the pictures as if taken by eyes that look at the stack's origin, the eyes (2, 3), and the
-    fov_deg. Pictures of other cameras (--camera) are resampled. Raises InputError if eyes or cameras are missing,
-    invalid or given twice.
+    fov_deg. Pictures of other cameras (--camera) are resampled. Raises InputError.
     """
     if eyes.cameras is None:
         if eyes.left is None or eyes.right is None:

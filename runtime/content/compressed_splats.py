@@ -42,9 +42,7 @@ def is_sog_folder(folder: Path) -> bool:
 
 
 def load_compressed_splats(path: Path) -> Gaussians:
-    """Read an SPZ file, a SOG file, or a folder with an unpacked SOG file. Raises InputError if it is
-    damaged, exceeds a limit, has an unsupported version, or contains no visible splats.
-    """
+    """Read an SPZ file, a SOG file, or a folder with an unpacked SOG file. Raises InputError."""
     if path.suffix.lower() != ".spz":
         with _damage_is(path, "is damaged or is not a SOG file"):
             return _sog(path)

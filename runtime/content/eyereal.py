@@ -50,8 +50,7 @@ def read_folder(folder: Path, preset: str) -> tuple[Pair, ...]:
     """Return all pairs in a folder, ordered by number.
 
     File names contain the eyes' positions in the scene's digital units, which determine whether `_0` or `_1` is the
-    left picture, and with which `_left` and `_right` in newer data must agree. Raises InputError if there are no pairs,
-    a pair is incomplete or ambiguous, or an eye is behind the display.
+    left picture, and with which `_left` and `_right` in newer data must agree. Raises InputError.
     """
     stack_from_scene: F64 = np.linalg.inv(drawn_scene_from_stack(preset)).astype(np.float64)
     files: dict[int, list[tuple[str, Path, F64]]] = {}

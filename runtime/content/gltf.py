@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from runtime.content import gltf_splats
 from runtime.content.base import WHITE
@@ -303,11 +304,9 @@ def _local(node: Table) -> F64:
     """Return a node's 4x4 parent_from_node matrix."""
     if "matrix" in node:
         return np.asarray(np.array(node["matrix"], np.float64).reshape(4, 4).T)
-    x, y, z, w = node.get("rotation", (0.0, 0.0, 0.0, 1.0))
-    turn = np.array([[w, -z, y, x], [z, w, -x, y], [-y, x, w, z], [-x, -y, -z, w]], np.float64)
-    back = np.array([[w, -z, y, -x], [z, w, -x, -y], [-y, x, w, -z], [x, y, z, w]], np.float64)
-    matrix: F64 = turn @ back / max(x * x + y * y + z * z + w * w, 1e-30)
-    matrix[:3, :3] *= np.array(node.get("scale", (1.0, 1.0, 1.0)), np.float64)
+    matrix = np.eye(4)
+    turn = Rotation.from_quat(node.get("rotation", (0.0, 0.0, 0.0, 1.0))).as_matrix()
+    matrix[:3, :3] = turn * np.array(node.get("scale", (1.0, 1.0, 1.0)), np.float64)
     matrix[:3, 3] = node.get("translation", (0.0, 0.0, 0.0))
     return matrix
 

@@ -28,9 +28,7 @@ def is_splats(primitive: Table) -> bool:
 
 
 def read_splats(file: GltfFile, primitive: Table) -> Gaussians:
-    """Read a primitive's splats, in the mesh's frame. Raises InputError if damaged or invisible, and as
-    `GltfFile`.
-    """
+    """Read a primitive's splats, in the mesh's frame. Raises InputError."""
     own = primitive["extensions"][SPLATS]
     for name in SPZ:
         if name in own.get("extensions", {}):

@@ -215,9 +215,8 @@ def _points(cloud: Any, origin: Origin) -> list[tuple[F32, F32]]:
 
 
 def _part(mesh: Any, matrix: F64, path: Path, pictures: dict[int, U8], origin: Origin) -> Part:
-    """Convert a trimesh mesh to a part with a material, with vertex or face colours, or in plain grey. `pictures`: the
-    textures converted so far, by their material's `id`; updated. Raises InputError if a face is not a triangle of
-    existing vertices.
+    """Convert a trimesh mesh to a part with a material, with vertex or face colours, or in plain grey.
+    `pictures`: the textures converted so far, by their material's `id`; updated. Raises InputError.
     """
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,) or faces.min() < 0 or faces.max() >= len(vertices):

@@ -5,6 +5,7 @@ All are loaded before the first one is shown, so missing files are reported at t
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import accumulate
@@ -160,6 +161,6 @@ class PlaylistSource(ForwardingSource):
         if not self._list.repeat:
             passed_ns = min(passed_ns, round_ns - 1)
         rounds, within_ns = divmod(passed_ns, round_ns)
-        index = next(index for index, end in enumerate(self._ends_ns) if within_ns < end)
+        index = bisect_right(self._ends_ns, within_ns)
         begin_ns = self._ends_ns[index - 1] if index else 0
         return rounds * count + index, within_ns - begin_ns

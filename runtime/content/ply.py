@@ -92,8 +92,7 @@ def read_header(path: Path) -> PlyHeader:
 
 def read_elements(header: PlyHeader) -> dict[str, Table]:
     """Read the elements in a binary PLY file as structured arrays, by name, up to the first that has a
-    list property. Raises InputError if the file is cut off or in text form, or if the vertices have not been read by
-    then.
+    list property. Raises InputError.
     """
     path, place, found = header.path, header.starts_at, dict[str, Table]()
     if header.order == "ascii":

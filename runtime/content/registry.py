@@ -65,8 +65,7 @@ def prepare_content(settings: ContentSettings, stack: PanelStack) -> Opener:
     """Read and check the scene specified by the settings, and return a function that creates the source.
 
     Preparation is slow, but may run on any thread and reports progress; only the function needs the GL context's
-    thread. Files are read in a child process, except for small pictures. Raises InputError, which names file and field,
-    if the scene cannot be shown or takes too long to load.
+    thread. Files are read in a child process, except for small pictures. Raises InputError.
     """
     file = SceneFile(Path(settings.scene), settings, stack)
     too_slow = InputError(settings.scene, "", f"takes longer than {LIMITS.load_s:g} s to load")

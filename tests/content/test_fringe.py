@@ -52,19 +52,6 @@ def test_the_diagonals_of_a_box_s_faces_are_no_outlines() -> None:
     assert len(ramps(box, [10.0, 20.0, 30.0], TILTED)) == 6
 
 
-def test_outlines_of_several_parts_come_in_the_order_asked_for() -> None:
-    parts = {
-        n: shape for n, shape in enumerate([shapes.box((1.0, 2.0, 3.0)), shapes.card(1.0, 1.0), shapes.sphere(1.0)])
-    }
-    eyes = [np.array([100.0, 3.0 * n, 1.0]) for n in range(3)]
-    together = OutlineRamps({n: (edges_of(shape), vertices_of(shape)) for n, shape in parts.items()})
-    size = {"width_px": 4000, "height_px": 4000}
-    found, counts = together.along([(n, eyes[n], AHEAD) for n in (2, 0)], **size)
-    assert len(found) == sum(counts)
-    for n, part in zip((2, 0), np.split(found, [counts[0]]), strict=True):
-        assert np.array_equal(part, ramps(parts[n], eyes[n].tolist()))
-
-
 def test_an_edge_behind_the_eye_has_no_ramp() -> None:
     card = shapes.card(1.0, 1.0)
     assert len(ramps(card, [100.0, 0.0, 0.0])) == 4

@@ -88,15 +88,13 @@ def test_an_mpo_without_its_second_picture_is_shown_flat_and_says_so(
     assert "a.mpo: the second picture is missing" in caplog.text
 
 
-@pytest.mark.parametrize(("group", "colours"), [((0, 1), (RED, BLUE)), ((1, 0), (BLUE, RED)), ((0, 2), (RED,))])
+@pytest.mark.parametrize(
+    ("group", "colours"), [((0, 1), (RED, BLUE)), ((1, 0), (BLUE, RED)), ((0, 2), (RED,)), ((), (RED,))]
+)
 def test_a_stereo_pair_in_a_heic_is_the_eyes(tmp_path: Path, group: tuple[int, int], colours: Any) -> None:
     pictures = [solid(RED), solid(BLUE), solid(GREEN, 80, 46)]
     found = views(heic_pair(tmp_path / "a.heic", pictures, group=group))
     assert [near(view[40, 40], colour) for view, colour in zip(found, colours, strict=True)]
-
-
-def test_pictures_in_a_heic_that_are_no_pair_stay_apart(tmp_path: Path) -> None:
-    assert len(views(heic_pair(tmp_path / "a.heic", [solid(RED), solid(BLUE)], group=()))) == 1
 
 
 # Names

@@ -33,8 +33,7 @@ def fitted(
 ) -> Answer:
     """Transform points (K, 3) by a known similarity, and compare the fitted similarity with the known
     one. The condition number is the points' largest coordinate divided by their RMS extent along the second principal
-    axis, in the worse frame. Relative errors in the coordinates, including rounding, rotate the fit by this
-    factor.
+    axis, in the worse frame. Relative errors in the coordinates, including rounding, rotate the fit by this factor.
     """
     stack_m = scale * sensor_m @ turn.T + offset_m
     matrix = fit(sensor_m, stack_m)
