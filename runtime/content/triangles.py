@@ -169,8 +169,8 @@ class DrawnPart:
         self._buffer, self._triangles = (context.buffer(array) for array in (self.vertices, self.triangles))
         if self.edges is None and not self.is_projected:  # this may free hundreds of MiB
             self.vertices, self.triangles = self.vertices[:0].copy(), self.triangles[:0].copy()
-        layout = _layout(surface_program, self._buffer, ("in_position", *ATTRIBUTES), (3, 3, 2, 4))
-        self.surface = context.vertex_array(surface_program, [layout], index_buffer=self._triangles)
+        layout = (self._buffer, "3f 3f 2f 4f", "in_position", *ATTRIBUTES)  # the compiler may have removed some
+        self.surface = context.vertex_array(surface_program, [layout], index_buffer=self._triangles, skip_errors=True)
 
     def draw_surface(self) -> None:
         """Draw the triangles."""
@@ -344,10 +344,9 @@ class TriangleSource(CanvasSource):
         """Return the vertex array for drawing the outlines of parts with the given features."""
         if features not in self._outlines:
             program = self._program((*features, "OUTLINE"))
-            names = ("in_clip", "in_coverage", *ATTRIBUTES)
-            layout = _layout(program, self._outline_buffer, names, (4, 1, 3, 2, 4))
+            layout = (self._outline_buffer, "4f 1f 3f 2f 4f", "in_clip", "in_coverage", *ATTRIBUTES)
             self._outlines[features] = self.context.vertex_array(
-                program, [layout], index_buffer=self._outline_triangles
+                program, [layout], index_buffer=self._outline_triangles, skip_errors=True
             )
         return self._outlines[features]
 
@@ -393,10 +392,3 @@ class TriangleSource(CanvasSource):
 def _gl(matrix: F64) -> F32:
     """Return a matrix in the column-major order that OpenGL expects."""
     return np.ascontiguousarray(matrix.T, np.float32)
-
-
-def _layout(program: Any, buffer: Any, names: tuple[str, ...], sizes: tuple[int, ...]) -> tuple[Any, ...]:
-    """Describe a buffer of named attributes of `sizes` floats for moderngl, without those that the compiler removed."""
-    used = [name for name in names if name in program]
-    formats = [f"{size}f" if name in used else f"{size * 4}x" for name, size in zip(names, sizes, strict=True)]
-    return (buffer, " ".join(formats), *used)
