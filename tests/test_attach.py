@@ -73,14 +73,19 @@ def disks(unit: float, radius_m: float = 0.006) -> Any:
         actor.GetProperty().SetColor(*np.array(colour) / 255)
         actor.GetProperty().LightingOff()
         renderer.AddActor(actor)
-    camera = renderer.GetActiveCamera()
-    camera.SetFocalPoint(0, 0, 0)
-    camera.SetPosition(0, 0, 0.6 * unit)
-    camera.SetViewUp(0, 1, 0)
-    camera.SetViewAngle(2 * np.degrees(np.arctan(STACK.height_m / 2 / 0.6)))
+    look(renderer, 0.6 * unit)
     renderer.ResetCameraClippingRange()
     window.Render()
     return window
+
+
+def look(renderer: Any, distance: float) -> None:
+    """Points the camera at the middle, so that the display's height fills the view from 60 cm."""
+    camera = renderer.GetActiveCamera()
+    camera.SetFocalPoint(0, 0, 0)
+    camera.SetPosition(0, 0, distance)
+    camera.SetViewUp(0, 1, 0)
+    camera.SetViewAngle(2 * np.degrees(np.arctan(STACK.height_m / 2 / 0.6)))
 
 
 def drawn_by(attachment: Any, draw: Any) -> Any:
@@ -143,16 +148,20 @@ def test_both_eyes_see_each_point_within_a_tenth_of_a_pixel(unit: float) -> None
     source.close()
 
 
+def nearness_in(views: list[Any], source: Any, attachment: Any) -> list[np.ndarray]:
+    def draw() -> list[np.ndarray]:
+        source.expect(views, time_ns=0)
+        both = [(source.render(view, time_ns=0), source.nearness(view, every=1, first=(0, 0))) for view in views]
+        return [nearness for _, nearness in both]
+
+    return drawn_by(attachment, draw)
+
+
 def test_depth_is_told_for_each_picture(small: Any) -> None:
     attachment = phasestack.attach(disks(50.0, radius_m=0.02), address=small.program["address"])
     attachment._size = 1.0
     views = raster_views(pair(EYES[1]), SMALL.panel(1))
-
-    def draw_both() -> list[tuple[np.ndarray, np.ndarray]]:
-        small.expect(views, time_ns=0)
-        return [(small.render(view, time_ns=0), small.nearness(view, every=1, first=(0, 0))) for view in views]
-
-    for view, (_, nearness) in zip(views, drawn_by(attachment, draw_both)):
+    for view, nearness in zip(views, nearness_in(views, small, attachment)):
         for side, up, out in DISKS:
             at = view.pixels_from_stack @ [out, side, up, 1.0]
             column, row = (at[:2] / at[2]).astype(int)
@@ -170,18 +179,8 @@ def test_a_scene_of_any_size_stays_within_the_comfort_budget(small: Any, unit: f
         actor.SetPosition(0, 0, 15 * actor.GetCenter()[2])  # ten times as deep as the display is high
     attachment = phasestack.attach(window, address=small.program["address"], comfort_deg=comfort_deg)
     attachment._size = 1.0
-    eyes_m = pair(EYES[0])
-    views = raster_views(eyes_m, SMALL.panel(1))
-
-    def nearness_of_both() -> list[np.ndarray]:
-        small.expect(views, time_ns=0)
-        both = []
-        for view in views:
-            small.render(view, time_ns=0)
-            both.append(small.nearness(view, every=1, first=(0, 0)))
-        return both
-
-    nearness = np.concatenate([one[one > 0] for one in drawn_by(attachment, nearness_of_both)])
+    views = raster_views(pair(EYES[0]), SMALL.panel(1))
+    nearness = np.concatenate([one[one > 0] for one in nearness_in(views, small, attachment)])
     angles_deg = np.degrees(2 * HALF_IPD_M * (nearness - 1 / 0.6))
     assert np.abs(angles_deg).max() <= comfort_deg + 0.01
     assert np.abs(angles_deg).max() > 0.9 * comfort_deg  # and uses it
@@ -252,11 +251,7 @@ def test_a_volume_is_where_its_points_are(small: Any, mapper: str) -> None:
     look.GetScalarOpacity().AddPoint(255, 0.05)
     look.GetRGBTransferFunction().RemoveAllPoints()
     look.GetRGBTransferFunction().AddRGBPoint(0, 1, 1, 1)
-    camera = renderer.GetActiveCamera()
-    camera.SetFocalPoint(0, 0, 0)
-    camera.SetPosition(0, 0, 0.6)
-    camera.SetViewUp(0, 1, 0)
-    camera.SetViewAngle(2 * np.degrees(np.arctan(STACK.height_m / 2 / 0.6)))
+    look(renderer, 0.6)
     attachment = phasestack.attach(window, address=small.program["address"])
     attachment._size = 1.0
     eyes_m = pair((0.6, 0.1, 0.05))
