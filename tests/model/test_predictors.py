@@ -39,6 +39,9 @@ POSES = {
 }
 
 
+GREY = np.full((270, 480, 4), 128, np.uint8)
+
+
 def solved(name: str, pair: np.ndarray, stack: PanelStack = STACK) -> np.ndarray:
     size = {"width_px": stack.width_px, "height_px": stack.height_px}
     pictures = [card_scene(eye, **size) for eye in pair]
@@ -138,28 +141,24 @@ def test_a_turned_and_tilted_head_gives_the_network_no_larger_raster(monkeypatch
 
     monkeypatch.setattr(ModelSession, "run", counted)
     predictor = load_predictor("fast", STACK)
-    grey = np.full((270, 480, 4), 128, np.uint8)
     # At the side: one eye is nearer, and the eyes are farther apart in height than sideways.
     turned = np.array([[0.85, 1.015, -0.011], [0.81, 1.045, -0.049]])
     for pair in (eyes(0.7), turned):
-        predictor.solve(drawn_job([grey, grey], pair, STACK))
+        predictor.solve(drawn_job([GREY, GREY], pair, STACK))
     assert sizes[1] < 1.5 * sizes[0]
 
 
-def test_eyes_behind_each_other_are_a_passing_model_failure() -> None:
-    predictor = load_predictor("fast", STACK)
-    grey = np.full((270, 480, 4), 128, np.uint8)
-    with pytest.raises(EyesNotServed, match="no horizontal separation") as caught:
-        predictor.solve(drawn_job([grey, grey], np.array([[0.6, 0.0, 0.0], [0.66, 0.0, 0.0]]), STACK))
-    assert isinstance(caught.value, ModelFailure)
-
-
-def test_an_eye_sigma_that_is_no_number_is_a_model_failure() -> None:
-    predictor = load_predictor("fast", STACK)
-    grey = np.full((270, 480, 4), 128, np.uint8)
-    for sigma_mm in (np.nan, np.inf):
-        with pytest.raises(ModelFailure):
-            predictor.solve(replace(drawn_job([grey, grey], eyes(0.6), STACK), eye_sigma_m=sigma_mm / 1e3))
+@pytest.mark.parametrize(
+    ("pair", "sigma_m", "error"),
+    [
+        (np.array([[0.6, 0.0, 0.0], [0.66, 0.0, 0.0]]), 1e-3, EyesNotServed),  # a passing failure
+        (eyes(0.6), np.nan, ModelFailure),
+        (eyes(0.6), np.inf, ModelFailure),
+    ],
+)
+def test_what_cannot_be_solved_is_a_model_failure(pair: np.ndarray, sigma_m: float, error: type[ModelFailure]) -> None:
+    with pytest.raises(error, match="no horizontal separation" if error is EyesNotServed else "."):
+        load_predictor("fast", STACK).solve(replace(drawn_job([GREY, GREY], pair, STACK), eye_sigma_m=sigma_m))
 
 
 def test_one_eye_that_stands_for_both_is_served() -> None:
@@ -204,10 +203,8 @@ def test_every_pixel_on_a_ray_through_all_panels_is_solved(pose: str) -> None:
             through &= (u > 0.5) & (u < 479.5) & (v > 0.5) & (v < 269.5)
         for box, (u, v) in zip(boxes, positions, strict=True):
             if through.any():
-                assert box.u0 <= u[through].min() - 0.5
-                assert box.u1 >= u[through].max() + 0.5
-                assert box.v0 <= v[through].min() - 0.5
-                assert box.v1 >= v[through].max() + 0.5
+                assert box.u0 <= u[through].min() - 0.5 and box.u1 >= u[through].max() + 0.5
+                assert box.v0 <= v[through].min() - 0.5 and box.v1 >= v[through].max() + 0.5
 
 
 def test_missing_kernels_are_told(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -85,13 +85,20 @@ def test_a_network_of_pictures_is_fed_what_the_runtime_feeds_it(tmp_path: Path) 
         network = dataclasses.replace(network, form=form)
         path = tmp_path / f"{frame}.onnx"
         path.write_bytes(picture_file(network, "", **SMALL))
-        predictor = load_predictor(str(path), pair.stack)
-        solve_still(*pair.images, eyes_m=pair.eyes_m, fov_deg=pair.fov_deg, predictor=predictor, eye_sigma_mm=0.0)
+        _, predictor = solved_by(path, pair)
         fed, wanted = predictor._proposal._input[0], network_input(pair, form)
         assert wanted.shape == fed.shape
         inside = slice(8, -8)  # outside the pictures the runtime extrapolates
         assert np.abs(fed - wanted)[:, inside, inside].max() < 3 / 255
-        predictor.close()
+
+
+def solved_by(path: Path, pair: TrainingPair) -> tuple[Prediction, Any]:
+    """A pair's solution by a model's file, and the predictor, closed."""
+    predictor = load_predictor(str(path), pair.stack)
+    how: dict[str, Any] = {"eyes_m": pair.eyes_m, "fov_deg": pair.fov_deg, "eye_sigma_mm": 0.0}
+    solved = solve_still(*pair.images, predictor=predictor, **how)
+    predictor.close()
+    return solved, predictor
 
 
 def test_what_is_displayed_is_clipped_in_eight_bits_and_lets_gradients_through() -> None:
@@ -247,16 +254,14 @@ def test_a_network_of_ones_own_is_trained_exported_and_served(tmp_path: Path) ->
     assert export_model(SHORT["arch"], path, checkpoint=checkpoint, width_px=160, height_px=96).passed
     assert validate_file(path).passed
     pair = random_pair(np.random.default_rng([4, 1]), **SMALL)
-    predictor = load_predictor(str(path), pair.stack)
+    solved, predictor = solved_by(path, pair)
     assert predictor.name == "MyNetwork"
-    solved = solve_still(*pair.images, eyes_m=pair.eyes_m, fov_deg=pair.fov_deg, predictor=predictor, eye_sigma_mm=0.0)
     net = make_network(SHORT["arch"], SHORT["options"]).net.eval()
     net.load_state_dict(load_checkpoint(checkpoint)["model"])
     with torch.no_grad():
         fed = torch.from_numpy(predictor._proposal._input)
         panels = net(fed)[0].clamp(0, 1).mul(255).round().reshape(3, 3, 96, 160)
     layers = solved.layers[..., :3].astype(np.float32)
-    predictor.close()
     assert solved.steps == 0
     assert np.abs(layers - panels.permute(0, 2, 3, 1).numpy()).max() <= 1
     with pytest.raises(InputError, match="is a checkpoint of my_network:MyNetwork, not "):
@@ -266,18 +271,15 @@ def test_a_network_of_ones_own_is_trained_exported_and_served(tmp_path: Path) ->
 def served(path: Path, number: int) -> tuple[Prediction, float]:
     """A pair's solution by a model's file, and its light by rays for the eyes that it was solved for."""
     pair = random_pair(np.random.default_rng([4, number]), **SMALL)
-    predictor = load_predictor(str(path), pair.stack)
-    solved = solve_still(*pair.images, eyes_m=pair.eyes_m, fov_deg=pair.fov_deg, predictor=predictor, eye_sigma_mm=0.0)
+    solved, _ = solved_by(path, pair)
     panels = torch.from_numpy(solved.layers[..., :3].transpose(0, 3, 1, 2).copy()) / 255
-    predictor.close()
-    return solved, of_pair(panels, pair)
+    return solved, light_db(panels, *of_pair(pair), random=torch.Generator().manual_seed(1))
 
 
-def of_pair(panels: Any, pair: TrainingPair) -> float:
-    """Its light in dB by rays."""
+def of_pair(pair: TrainingPair) -> tuple[Any, Views]:
+    """Targets and views."""
     views = Views.of(pair.stack, pair.eyes_m, **SMALL, fov_deg=pair.fov_deg)
-    targets = torch.from_numpy(np.stack(pair.images).transpose(0, 3, 1, 2).copy()) / 255
-    return light_db(panels, targets, views, random=torch.Generator().manual_seed(1))
+    return torch.from_numpy(np.stack(pair.images).transpose(0, 3, 1, 2).copy()) / 255, views
 
 
 def test_steps_after_a_learned_proposal_are_trained_and_raise_its_light(tmp_path: Path) -> None:
@@ -286,8 +288,7 @@ def test_steps_after_a_learned_proposal_are_trained_and_raise_its_light(tmp_path
     for steps in (0, 2):
         path = tmp_path / f"{steps}.onnx"
         options = {"steps": steps} if steps == 0 else {}  # the checkpoint says that there are two
-        size = {"width_px": SMALL["width_px"], "height_px": SMALL["height_px"]}
-        report = export_model(SHORT["arch"], path, checkpoint=tmp_path / "checkpoint.pth", options=options, **size)
+        report = export_model(SHORT["arch"], path, checkpoint=tmp_path / "checkpoint.pth", options=options, **SMALL)
         assert report.passed and validate_file(path).passed
         found[steps] = [served(path, number) for number in (1, 2, 3)]
     assert [solved.steps for solved, _ in found[0] + found[2]] == [0] * 3 + [2] * 3
@@ -314,9 +315,8 @@ def test_unrolled_steps_learn_their_sizes_and_are_served_with_them(tmp_path: Pat
     pair = random_pair(np.random.default_rng([4, 1]), **SMALL)
     with torch.no_grad():
         batch = torch.utils.data.default_collate([{"input": torch.from_numpy(network_input(pair, Form()))}])
-        views = Views.of(pair.stack, pair.eyes_m, **SMALL, fov_deg=pair.fov_deg)
-        targets = torch.from_numpy(np.stack(pair.images).transpose(0, 3, 1, 2).copy()) / 255
-        x = network.net(batch["input"])[0].reshape(3, 3, 96, 160)
-        in_torch = of_pair(displayed(improved(x, targets, views, *network.steps())), pair)
+        x, of = network.net(batch["input"])[0].reshape(3, 3, 96, 160), of_pair(pair)
+        panels = displayed(improved(x, *of, *network.steps()))
+        in_torch = light_db(panels, *of, random=torch.Generator().manual_seed(1))
     solved, db = served(path, 1)
     assert solved.steps == 3 and db == pytest.approx(in_torch, abs=0.5)

@@ -170,12 +170,9 @@ def test_six_bits_round_to_64_levels() -> None:
     assert len(np.unique(angles)) == 64
 
 
-def test_contrast_is_the_ratio_of_white_to_black() -> None:
+def test_contrast_is_the_ratio_of_white_to_black_and_cells_add_up() -> None:
     assert black_level([Cell(contrast=500.0)], math.inf) == pytest.approx(1 / 500)
     assert black_level([Cell()], 2000.0) == pytest.approx(1 / 2000)
-
-
-def test_three_cells_of_a_thousand_leave_a_third_of_it() -> None:
     assert black_level([Cell(contrast=1000.0)] * 3, math.inf) == pytest.approx(3 / 1000, rel=0.01)
 
 
