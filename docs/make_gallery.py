@@ -61,7 +61,6 @@ FILM_S = 2.0, 8.0  # the film's start and end within the run
 PEOPLE_PX = 320, 180  # size of each eye's picture in the film of two people
 PICTURES = {  # name in docs/images: path in the work folder
     "boards.jpg": "boards.png",
-    "kinds.jpg": "kinds.png",
     "contact-sheet.jpg": "demo/contact-sheet.png",
     "frontier.png": "report/frontier-scenes.png",
     "moving-viewer.png": "report/moving-viewer.png",
@@ -155,23 +154,6 @@ def _number(value: float | None) -> str:
 def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     lines = [headings, ["---"] * len(headings), *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
-
-
-def kinds(folder: Path) -> Image.Image:
-    """Draw a contact sheet of the runs made by `examples/content.py`.
-
-    Each row shows the front layer, both eyes' views, and the left eye's target.
-    """
-    names = ("layer-2.png", "seen-left.png", "seen-right.png", "wanted-left.png")
-    runs = sorted(path.parent for path in folder.glob(f"*/{names[0]}"))
-    width, height, rows = 176, 99, -(-len(runs) // 2)
-    sheet = Image.new("RGB", (2 * len(names) * width + 8, rows * (height + 16)), "white")
-    for number, run in enumerate(runs):
-        x, y = number // rows * (len(names) * width + 8), number % rows * (height + 16)
-        ImageDraw.Draw(sheet).text((x + 2, y + 2), run.name, fill="black")
-        for column, name in enumerate(names):
-            sheet.paste(Image.open(run / name).convert("RGB").resize((width, height)), (x + column * width, y + 15))
-    return sheet
 
 
 def boards() -> Image.Image:
@@ -380,12 +362,6 @@ def main() -> None:
         out = arguments.work / command[0]
         if not (arguments.keep and out.is_dir()):
             subprocess.run([sys.executable, "-m", "runtime.cli", *command, "--out", str(out)], check=True)
-    content = arguments.work / "content"
-    if not (arguments.keep and content.is_dir()):
-        subprocess.run(
-            [sys.executable, str(DOCS.parent / "examples" / "content.py"), "--out", str(content)], check=True
-        )
-    kinds(content).save(arguments.work / "kinds.png")
     boards().save(arguments.work / "boards.png")
     look_into(arguments.work / "look")
     leaning(arguments.work / "look")

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -17,7 +14,6 @@ from model_export.light import FLOOR, Views, light, step, traced  # noqa: E402
 from model_export.scene import draw, random_scene  # noqa: E402
 from runtime.optics.stack import PanelStack, Tilt  # noqa: E402
 from runtime.optics.views import image_from_raster, image_from_stack  # noqa: E402
-from runtime.support.artifacts import write_png  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[2]
 EYES = np.array([[0.62, -0.04, 0.03], [0.6, 0.024, 0.035]])
@@ -157,31 +153,3 @@ def test_a_step_is_bounded_by_the_curvature_and_its_floor() -> None:
         s = np.pi * sum(values)
         moved = 0.5 * 2 * (1 - np.cos(s)) / 2 * np.sin(s) / (1.5 * np.pi * max(2 * np.sin(s) ** 2, FLOOR * 2)) * 3 / 2
         assert (x - new).numpy() == pytest.approx(np.full((2, 1, 2, 2), moved), abs=1e-12)
-
-
-@pytest.mark.slow
-def test_the_example_that_bounds_what_panels_could_show_runs(tmp_path: Path, still: tuple[PanelStack, Any]) -> None:
-    for name, target in zip(("left.png", "right.png"), still[1], strict=True):
-        write_png(tmp_path / name, (target * 255).round().byte().permute(1, 2, 0).numpy())
-    (tmp_path / "panels.json").write_text('{"width_m": 0.5184, "height_m": 0.2916, "x_m": [-0.02, 0.0, 0.02]}')
-    eyes = [word for name, eye in zip(("left", "right"), EYES) for word in (f"--{name}-eye", *map(str, eye))]
-    command = [
-        sys.executable,
-        str(ROOT / "examples" / "adam_bound.py"),
-        "left.png",
-        "right.png",
-        "--panels",
-        "panels.json",
-    ]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [*command, *eyes, "--width", "96", "--iterations", "400"],
-        cwd=tmp_path,
-        env=environment,
-        capture_output=True,
-        text=True,
-    )
-    rows = [row.split(", ") for row in done.stdout.splitlines()]
-    assert rows[0] == ["method", "number", "dB"], done.stderr
-    by_steps, by_adam = ([float(row[2]) for row in rows if row[0] == method] for method in ("steps", "Adam"))
-    assert by_steps[-1] > by_steps[0] + 10 and by_adam[-1] > by_steps[-1] + 0.5, (by_steps, by_adam)
