@@ -62,7 +62,7 @@ class Display:
     def __init__(self, run: Run, folder: Path, accounts: list[RefreshAccount]) -> None:
         self.run, self.accounts = run, accounts
         self._scene_file, self._sensor_file = folder / "scene", folder / "sensor"
-        self._settings = run.presenter.state.settings
+        self._settings = run.presenter.settings
         self._answers: list[Answer] = []
 
     def signal(self, role: str, number: int) -> None:

@@ -165,7 +165,7 @@ class Recorder(logging.Handler):
         """Start recording a presenter, always in the `sensor` frame, even if samples arrive in `stack`."""
         self._presenter = presenter
         if in_stack_frame:
-            self._sensor_from_stack = np.asarray(np.linalg.inv(presenter.state.calibration.stack_from_sensor))
+            self._sensor_from_stack = np.asarray(np.linalg.inv(presenter.viewer.calibration.stack_from_sensor))
         for name in ROOTS:
             logging.getLogger(name).addHandler(self)
 
@@ -317,7 +317,7 @@ class Recorder(logging.Handler):
 
 def _head(presenter: Presenter) -> tuple[RecordingHeader, str]:
     """Return the recording header, and the settings as JSON, to be written before a file's messages."""
-    settings = presenter.state.settings
+    settings = presenter.settings
     header = RecordingHeader(settings.sensor.driver, presenter.samples.serial)
     return header, without_secrets(settings.model_dump_json())
 

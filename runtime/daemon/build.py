@@ -28,7 +28,6 @@ from runtime.frame.messages import Facts, Live
 from runtime.frame.observer import RunObserver
 from runtime.frame.pacing import Pacer
 from runtime.frame.presenter import Presenter, Supervisor
-from runtime.frame.run_state import RunState
 from runtime.frame.solver_host import SimulatedSolver, SolverHost
 from runtime.frame.solver_process import Known, SolverProcess
 from runtime.frame.targets import TargetDrawer
@@ -229,7 +228,7 @@ def build_run(
         pose.append(PoseSender(settings.pose))
         cleanup.callback(pose[0].close)
     presenter = Presenter(
-        RunState(0, settings, calibration),
+        settings,
         stack,
         clock=clock,
         pacer=pacer,

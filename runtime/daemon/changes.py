@@ -114,7 +114,7 @@ class Changes:
 
     def __init__(self, presenter: Presenter) -> None:
         self._presenter = presenter
-        self.choices = Choices(presenter.state.settings)
+        self.choices = Choices(presenter.settings)
         self.refused = ""  # why the latest change was refused; empty if it was accepted
         self._loading: _Loading | None = None
         self._waiting: list[_Loading] = []  # one for each command's name, to start once the current change is over

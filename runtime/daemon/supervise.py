@@ -97,7 +97,7 @@ class Daemon(Host):
         if self._server is not None:
             presenter = run.presenter
             self._server.lookups |= {
-                "about": lambda: answers.about(presenter.state.settings, presenter.stack),
+                "about": lambda: answers.about(presenter.settings, presenter.stack),
                 "pictures": lambda: answers.pictures(presenter.status, presenter.stack),
             }
             self._server.lookups |= {"log": self.recorder.look_at_log} if self.recorder is not None else {}

@@ -24,7 +24,6 @@ from runtime.frame.messages import SolverUpdate
 from runtime.frame.pacing import Pacer
 from runtime.frame.policy import Flatness, wants_flat
 from runtime.frame.refresh import Refresh, RefreshTimes, Status
-from runtime.frame.run_state import RunState
 from runtime.frame.served import accounts_of, matched
 from runtime.frame.solver_host import SolverHost
 from runtime.frame.states import Conditions, Lateness, Part, StateMachine
@@ -81,7 +80,7 @@ class Presenter:
 
     def __init__(
         self,
-        state: RunState,
+        settings: Settings,
         stack: PanelStack,
         *,
         clock: Clock,
@@ -98,11 +97,10 @@ class Presenter:
         """Create a presenter, whose stages take `stage_ms` on a simulated clock. `fixed` is the effort if
         `model.effort` is `full`, by default all steps on the full raster.
         """
-        self.state, self.stack, self.clock = state, stack, clock
+        self.settings, self.stack, self.clock = settings, stack, clock
         self.pacer, self.samples, self.viewer, self.solver, self.panels = pacer, samples, viewer, solver, panels
         self._stage_ms = stage_ms
         self._supervisor, self._observers = supervisor or Supervisor(), observers
-        self._adopted = state.version
         self._aim = Aim(viewer, solver, period_ns=pacer.period_ns, fixed=fixed)
         self.stats = RunStats()
         self.machine = StateMachine(now_ns=clock.now_ns())
@@ -116,7 +114,7 @@ class Presenter:
         self._shown_solution: int | None = None  # number of the solution shown at the previous refresh
         self._drew_solution = False  # True once the panels have shown a solution
         self._aligned: tuple[int, bytes, Alignment] | None = None  # number of the solution, eyes, alignment
-        delays = [round(panel.delay_ms * NS_PER_MS) for panel in state.settings.output.panels]
+        delays = [round(panel.delay_ms * NS_PER_MS) for panel in settings.output.panels]
         self._delays_ns = delays if any(delays) else []  # of each panel; empty: all are in step
 
     def run(self, *, frames: int | None = None) -> str:
@@ -141,7 +139,6 @@ class Presenter:
         times.lap("wait")
         woke_ns = self.clock.now_ns()
         self._supervisor.carry_out_commands(self)
-        self._adopt_settings()
         self._receive(woke_ns)
         times.lap("sensor")
         eyes = self.viewer.at(timing.photon_ns)
@@ -159,7 +156,7 @@ class Presenter:
             timing,
             eyes,
             news.solution,
-            self.state.settings,
+            self.settings,
             composed_ns=composed_ns,
             now_ns=self.clock.now_ns(),
             flat_wanted=wants_flat(eyes, flat_asked=self.flat_asked, flatness=self._flatness.value),
@@ -172,17 +169,10 @@ class Presenter:
         self._report(account, frame, news.solution, times)
         return account
 
-    def _adopt_settings(self) -> None:
-        """Adopt any settings changed since the last refresh."""
-        state = self.state
-        if state.version != self._adopted:
-            self._adopted = state.version
-            self.viewer.adopt(state.settings, state.calibration)
-
     def adopt(self, settings: Settings, calibration: Calibration | None = None) -> None:
-        """Use other settings, and perhaps another calibration, from the next refresh on."""
-        state = self.state
-        self.state = RunState(state.version + 1, settings, calibration or state.calibration)
+        """Use other settings, and perhaps another calibration, from now on."""
+        self.settings = settings
+        self.viewer.adopt(settings, calibration)
 
     def _receive(self, now_ns: int) -> None:
         for sample in self.samples.arrived(now_ns):
@@ -240,7 +230,7 @@ class Presenter:
         """Align the solution to the eyes, or return its previous alignment if no eyes are known. If the layers are
         shown as solved, the alignment contains no matrices.
         """
-        plan = self.state.settings.plan
+        plan = self.settings.plan
         if solution is None or solution.solved_for_m is None or not plan.align:
             return Alignment(())
         last = self._aligned
@@ -366,7 +356,7 @@ class Presenter:
             missing=self.missing,
             paused=self.paused,
             flat_asked=self.flat_asked,
-            settings=self.state.settings,
+            settings=self.settings,
             facts=self.solver.facts,
             live=self.solver.live,
             people_in_view=viewer.in_view,

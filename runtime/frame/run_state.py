@@ -1,4 +1,4 @@
-"""States that are replaced as a whole: the presenter's, and the solver's."""
+"""State of a solver, replaced as a whole."""
 
 from __future__ import annotations
 
@@ -8,17 +8,7 @@ from typing import Any
 
 from runtime.config import Settings
 from runtime.content.base import ContentSource
-from runtime.eyes.calibration import Calibration
 from runtime.model.predictor import Predictor
-
-
-@dataclass(frozen=True, slots=True)
-class RunState:
-    """The settings and the calibration that the presenter uses together."""
-
-    version: int  # unique among the states of a run
-    settings: Settings
-    calibration: Calibration
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,16 +33,16 @@ class Viewer:
         self, settings: Settings, calibration: Calibration, *, front_m: float, in_stack_frame: bool = False
     ) -> None:
         """Create an estimator for people in front of a front panel at x = `front_m`, not seen yet."""
-        self._settings, self._calibration = settings, calibration
+        self._settings, self.calibration = settings, calibration
         self._nearest_m, self._in_stack_frame = front_m + IN_FRONT_M, in_stack_frame
         self._people = self._new_people()
         self._refusals = RefusalWatch()
         self._serial_checked = False
         self._captures_ns: deque[int] = deque(maxlen=64)
 
-    def adopt(self, settings: Settings, calibration: Calibration) -> None:
-        """Adopt new settings and a new calibration. Trackers are reset only if theirs have changed."""
-        before, self._settings, self._calibration = self._settings, settings, calibration
+    def adopt(self, settings: Settings, calibration: Calibration | None = None) -> None:
+        """Adopt new settings and perhaps a new calibration. Trackers are reset only if theirs have changed."""
+        before, self._settings, self.calibration = self._settings, settings, calibration or self.calibration
         if settings.tracker != before.tracker:
             self._people = self._new_people()
         if (settings.plan, settings.model) != (before.plan, before.model):
@@ -92,13 +92,13 @@ class Viewer:
         it.
         """
         self._captures_ns.append(frame.capture_ns)
-        people = frame.people if self._in_stack_frame else [self._calibration.apply(points) for points in frame.people]
+        people = frame.people if self._in_stack_frame else [self.calibration.apply(points) for points in frame.people]
         for refused in self._people.update(people, capture_ns=frame.capture_ns):
             if line := self._refusals.update(refused):
                 log.warning("%s", line)
         if not self._serial_checked and serial:
             self._serial_checked = True
-            if warning := self._calibration.serial_warning(serial):
+            if warning := self.calibration.serial_warning(serial):
                 log.warning("%s", warning)
 
     def at(self, display_ns: int) -> EyesEstimate:

@@ -247,7 +247,7 @@ def test_a_reload_keeps_what_was_chosen_unless_the_file_changed_it(served: Serve
     served.config.write_text(configuration() + "\n[plan]\nalign = false\n")
     answer = served.asked("reload")
     assert answer == holds and served.rig.content is content
-    assert served.rig.presenter.state.settings.plan.align is False
+    assert served.rig.presenter.settings.plan.align is False
     served.config.write_text(configuration(scene="flat"))
     answer = served.asked("reload")
     assert (answer["scene"], answer["model"], answer["placing"]["scale"]) == ("flat", "balanced", 1.5)

@@ -135,7 +135,7 @@ def answered(rig: Rig, order: Any) -> Answer:
 
 
 def test_the_next_solver_takes_up_scene_model_and_place_as_last_set(rig: Rig) -> None:
-    solver, settings = rig.presenter.solver, rig.presenter.state.settings
+    solver, settings = rig.presenter.solver, rig.presenter.settings
     content = settings.content.model_copy(update={"scene": "demo", "options": {}})
     model = settings.model.model_copy(update={"name": "balanced"})
     try:
@@ -153,7 +153,7 @@ def test_the_next_solver_takes_up_scene_model_and_place_as_last_set(rig: Rig) ->
 
 
 def test_a_scene_that_hangs_or_crashes_while_it_loads_is_refused(rig: Rig, deed: Path) -> None:
-    settings = rig.presenter.state.settings
+    settings = rig.presenter.settings
     options = {"file": str(deed), "making": True}
     content = settings.content.model_copy(update={"options": options})
     deed.write_text("crash")
@@ -165,7 +165,7 @@ def test_a_scene_that_hangs_or_crashes_while_it_loads_is_refused(rig: Rig, deed:
 
 @pytest.mark.parametrize("making", [True, False])
 def test_a_scene_that_takes_seconds_to_take_over_is_no_fault(rig: Rig, deed: Path, making: bool) -> None:
-    settings, faults = rig.presenter.state.settings, dict(rig.presenter.stats.faults)
+    settings, faults = rig.presenter.settings, dict(rig.presenter.stats.faults)
     other = deed.with_name("other")  # the present scene must not do it
     options = {"file": str(other), "making": making}
     other.write_text("nap")

@@ -17,7 +17,6 @@ from runtime.frame.messages import Answer, Facts, Live, Order, SolverUpdate
 from runtime.frame.pacing import Pacer
 from runtime.frame.presenter import Presenter
 from runtime.frame.refresh import Refresh
-from runtime.frame.run_state import RunState
 from runtime.frame.solver_host import SolverHost
 from runtime.frame.viewer import Viewer
 from runtime.optics.stack import PanelStack
@@ -228,7 +227,7 @@ class Stage:
         self.viewer = Viewer(self.settings, calibration, front_m=max(STACK.x_m), in_stack_frame=True)
         self.pacer = Pacer(period_ns=PERIOD_NS, photon_ns=8 * NS_PER_MS, work_ns=round(1.2 * NS_PER_MS))
         self.presenter = Presenter(
-            RunState(0, self.settings, calibration),
+            self.settings,
             STACK,
             clock=self.clock,
             pacer=self.pacer,
@@ -257,5 +256,5 @@ class Stage:
 
     def change(self, **plan: Any) -> None:
         """Other settings of the plan hold from the next refresh on."""
-        settings = self.presenter.state.settings
+        settings = self.presenter.settings
         self.presenter.adopt(settings.model_copy(update={"plan": settings.plan.model_copy(update=plan)}))

@@ -390,7 +390,7 @@ def test_every_sample_reaches_the_viewer_and_the_observer_in_order() -> None:
 
 
 def test_other_settings_reach_the_viewer_with_the_next_refresh(stage: Stage) -> None:
-    settings = stage.presenter.state.settings
+    settings = stage.presenter.settings
     tracker = settings.tracker.model_copy(update={"hold_s": 0.0})
     stage.presenter.adopt(settings.model_copy(update={"tracker": tracker}))
     stage.eyes = lambda _: None

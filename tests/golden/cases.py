@@ -59,7 +59,7 @@ def change_scene(name: str) -> Action:
     """`ctl scene`, complete before the simulated clock continues."""
 
     def do(presenter: Presenter) -> None:
-        present = presenter.state.settings
+        present = presenter.settings
         settings = present.model_copy(update={"content": present.content.model_copy(update={"scene": name})})
         deadline_s, answers = time.monotonic() + LOADED_WITHIN_S, list[Answer]()
         presenter.solver.send(ChangeSettings(settings, reload_content=True), answers.append)
