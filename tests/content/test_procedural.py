@@ -85,11 +85,11 @@ def test_the_same_view_and_time_give_the_same_bytes_in_any_context(context: Any)
 
 
 def test_alpha_is_zero_exactly_where_only_the_background_shows(context: Any) -> None:
-    source = ProceduralSource("sparse", stack=STACK, context=context, background=(1.0, 0.5, 0.0))
+    source = ProceduralSource("sparse", stack=STACK, context=context, background=(1.0, 0.4, 0.0))
     picture = source.render(panel_view(EYES["ahead"], STACK.panel(1)), time_ns=0)
     empty = picture[..., 3] == 0
     assert 0.9 < empty.mean() < 0.99
-    assert (picture[empty][:, :3] == [255, 128, 0]).all()
+    assert (picture[empty][:, :3] == [255, 102, 0]).all()
     assert (picture[..., 3] == 255).mean() > 0.01
 
 

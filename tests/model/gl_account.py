@@ -13,8 +13,8 @@ import pytest
 from runtime.model.gl.programs import Image, Passes
 
 CODES, NUMBERS = "codes", "numbers"  # of 8 and of 16 bits
-KINDS = {"f1": CODES, "nu2": NUMBERS, "f4": "tables"}
-BYTES = {"f1": 1, "nu2": 2, "f4": 4}
+KINDS = {"f1": CODES, "nu2": NUMBERS, "i2": NUMBERS, "f4": "tables"}
+BYTES = {"f1": 1, "nu2": 2, "i2": 2, "f4": 4}
 
 
 @dataclass

@@ -119,14 +119,13 @@ class GlSolution:
             self._passes.target((self._panel("last", n),)).clear(rest, rest, rest, rest)
 
     def set_panel(self, panel: int, codes: I16) -> None:
-        box = self._geometry.boxes[panel]
-        if self._stack.is_grey(panel) and codes.ndim == 3:
-            codes = np.repeat(codes.mean(axis=2, keepdims=True).astype(np.int16), 3, axis=2)
-        unit = 65535 / (3 * FULL)
-        stored = np.asarray(cv2.addWeighted(codes, unit, codes, 0.0, FULL * unit, dtype=cv2.CV_16U))
-        if stored.ndim == 3:
-            stored = np.dstack([stored, stored[..., :1]])
-        self._panel("last", panel).texture.write(stored, viewport=(0, 0, box.width_px, box.height_px), alignment=1)
+        box, grey = self._geometry.boxes[panel], self._stack.is_grey(panel) and codes.ndim == 3
+        if codes.ndim == 3:
+            codes = np.asarray(cv2.cvtColor(codes.view(np.uint16), cv2.COLOR_RGB2RGBA)).view(np.int16)
+        size = self._stack.width_px, self._stack.height_px
+        held = Image(self._state.texture("codes", size, self._components, dtype="i2"), box.width_px, box.height_px)
+        held.texture.write(np.ascontiguousarray(codes), viewport=(0, 0, *held.size), alignment=1)
+        self._passes.draw("load", (self._panel("last", panel),), {"codes": held}, {"grey": grey})
 
     def panel(self, panel: int) -> I16:
         image, components = self._panel("last", panel), self._components
@@ -134,7 +133,11 @@ class GlSolution:
             viewport=(0, 0, *image.size), components=components, dtype="nu2", alignment=1
         )
         stored = np.frombuffer(held, np.uint16).reshape(image.height_px, image.width_px, components)
-        return np.asarray(np.rint(stored[..., : self._channels] * (3 * FULL / 65535) - FULL), np.int16)
+        if components == 4:
+            stored = np.asarray(cv2.cvtColor(stored, cv2.COLOR_RGBA2RGB), np.uint16)
+        unit = 3 * FULL / 65535
+        codes = np.asarray(cv2.addWeighted(stored, unit, stored, 0.0, -FULL, dtype=cv2.CV_16S), np.int16)
+        return codes.reshape(image.height_px, image.width_px, self._channels)
 
     def close_middle(self) -> None:
         sets, middle = self._geometry.closing_sets(), self._geometry.middle
