@@ -23,18 +23,9 @@ PREFERRED = 0.92  # a slower effort is chosen if its mean error is below this sh
 GAIN = 0.2  # weight given to the latest measurement in a running mean
 LOAD_SHARE = 0.8  # exponent of a raster's slowdown in that of the others; the rest is attributed to the raster itself
 KEPT_SOLUTIONS = 100  # a raster's times are discarded after this many solutions on other rasters
-# Squared light error without any steps by reduction, relative to the full raster, and after k steps, relative to none:
-# `balanced` solver, means over the demo, texture and moving scenes at 960x540, with a still and a leaning head and with
-# tracking errors of 0.3 and 3 mm, as measured by `SolutionMeter`. Steps after the fourth hardly matter.
-RASTER_SHARES = {1: 1.0, 2: 2.1, 3: 2.5, 4: 3.5}
+# Squared light error after k steps, relative to none. Steps after the fourth hardly matter.
 STEP_SHARES = (1.0, 0.68, 0.53, 0.36, 0.34, 0.34, 0.33, 0.33, 0.33)
 FIRST_RESIDUAL = 1e-3  # initial estimate of the squared error on the full raster without any steps
-FIRST_DETAIL = {
-    1: 0.0,
-    2: 1.6e-3,
-    3: 3.6e-3,
-    4: 6e-3,
-}  # initial estimates of the squared error due to detail lost on coarse rasters, keyed by reduction
 FIRST_RATE = 0.5  # initial estimate of a, per metre, from the demo scene
 BLUR_M = 4e-3  # d0; farther away, outlines are displaced by more than their blur and the error grows linearly
 FIRST_CONTRAST = 0.03  # initial estimate of D_max
@@ -43,6 +34,24 @@ LEAST_SCALE, MOST_SCALE = 0.02, 4.0
 MOST_FOUND = 16.0  # limit on the ratio at a single refresh, because samples may be mistaken
 TAIL = 0.02  # slope with respect to y left at saturation, so that a smaller distance is always better
 SCALE_M, SCALE_S = 5e-3, 0.1  # units of displacement and time used in fitting the rates
+
+
+@dataclass(frozen=True, slots=True)
+class RasterError:
+    """Squared light errors of solutions on one raster without any steps."""
+
+    share: float  # relative to the full raster
+    first_detail: float  # due to detail lost on the raster: an initial estimate, until measured
+
+
+# By reduction. Shares here and in STEP_SHARES: `balanced` solver, means over the demo, texture and moving scenes at
+# 960x540, with a still and a leaning head and with tracking errors of 0.3 and 3 mm, as measured by `SolutionMeter`.
+RASTER_ERRORS = {
+    1: RasterError(1.0, 0.0),
+    2: RasterError(2.1, 1.6e-3),
+    3: RasterError(2.5, 3.6e-3),
+    4: RasterError(3.5, 6e-3),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,7 +201,9 @@ class PictureStatistics:
     """Estimates solution errors and how fast the pictures change, based on measurements."""
 
     residual: float = FIRST_RESIDUAL  # squared error on the full raster without any steps
-    detail: dict[int, float] = field(default_factory=lambda: dict(FIRST_DETAIL))  # error from lost detail, by reduction
+    detail: dict[int, float] = field(  # error from lost detail, by reduction
+        default_factory=lambda: {by: error.first_detail for by, error in RASTER_ERRORS.items()}
+    )
     rate_m: float = FIRST_RATE  # a, per metre
     rate_s2: float = 0.0  # b, per square second
     contrast: float = FIRST_CONTRAST  # D_max
@@ -242,7 +253,7 @@ def step_share(steps: int) -> float:
 
 def residual_share(effort: Effort) -> float:
     """Return the solver's squared error, relative to that on the full raster without any steps."""
-    return RASTER_SHARES.get(effort.reduction, 1.0) * step_share(effort.steps)
+    return RASTER_ERRORS[effort.reduction].share * step_share(effort.steps)
 
 
 def candidates(reductions: tuple[int, ...], steps: int) -> list[Effort]:

@@ -14,11 +14,12 @@ from runtime.daemon.build import RunOptions, build_run
 from runtime.errors import FatalError
 from runtime.evaluation.motion_recording import write_motion
 from runtime.frame.kept_light import Output
+from runtime.model.solver import REDUCTIONS
 from runtime.records import Effort
 
 SCENES = {"still": "demo", "lean": "demo", "walk": "demo", "stop-and-go": "demo", "film": "moving"}  # by motion
 FULL = Effort(1, 4)  # full raster and all steps of the `balanced` model
-FIXED = (FULL, Effort(1, 1), Effort(1, 0), Effort(2, 0), Effort(3, 0), Effort(4, 0))
+FIXED = (FULL, Effort(1, 1), *(Effort(by, 0) for by in REDUCTIONS))
 # Simulated times for a solution's stages on the full raster, as on a slow processor.
 COSTS_MS = {"render": 44, "prepare": 40, "inference": 31, "finish": 38, "step": 85}
 SECONDS, NOISE_MM, SEED = 6.0, 0.3, 5

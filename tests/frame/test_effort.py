@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 
 from runtime.frame.effort import (
     BLUR_M,
-    FIRST_DETAIL,
     KEPT_SOLUTIONS,
-    RASTER_SHARES,
+    RASTER_ERRORS,
     REST,
     CostBook,
     Costs,
@@ -42,10 +41,10 @@ def chosen(speed_m_s: float, *, sigma_m: float = 5e-4, slower: float = 1.0, show
     )
 
 
-def test_every_raster_has_a_first_estimate_of_its_lost_detail() -> None:
-    """Without one it counts as sharp as the display's own, and is chosen for every head that moves."""
-    assert tuple(FIRST_DETAIL) == REDUCTIONS
-    assert list(FIRST_DETAIL.values()) == sorted(FIRST_DETAIL.values())
+def test_every_raster_has_errors_that_grow_as_it_gets_coarser() -> None:
+    assert tuple(RASTER_ERRORS) == REDUCTIONS
+    for values in ([e.share for e in RASTER_ERRORS.values()], [e.first_detail for e in RASTER_ERRORS.values()]):
+        assert values == sorted(values)
 
 
 def test_costs_of_the_simulated_clock_follow_the_contract() -> None:
@@ -123,8 +122,6 @@ def test_a_coarse_solutions_residual_tells_little_of_the_full_rasters() -> None:
     pictures.learn(Measures(residual=3e-3), Effort(4, 0))
     assert pictures.own(Effort(4, 0)) == pytest.approx(pictures.detail[4] + 3e-3)
     assert pictures.own(Effort(1, 0)) < pictures.own(Effort(2, 2)) - pictures.detail[2]
-    assert tuple(RASTER_SHARES) == REDUCTIONS
-    assert list(RASTER_SHARES.values()) == sorted(RASTER_SHARES.values())
 
 
 def test_displacements_are_scaled_to_those_that_come_to_pass() -> None:
