@@ -70,14 +70,14 @@ def grey(
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure one panel's grey curve and write its inverse as a LUT.
+    """Measure one panel's grey curve for each colour channel and write their inverses as a LUT.
 
     First show the chart with --show. In a dark room, photograph it with any camera from two or three positions. Lock
     the exposure, keep the whole chart in the picture and avoid overexposure. Then pass the folder with the photographs
     as --photos. Photographs cannot show a panel's angles: find them with an analyser, and pass --white-deg and
     --black-deg.
 
-    Example: phasestack calibrate grey --panel 2 --photos photos --out panel-2.csv
+    Example: phasestack calibrate grey --panel 2 --photos photos --config phasestack.toml --out panel-2.csv
     """
     if show == (photos is not None) or (photos is not None and out is None):
         raise InputError("calibrate grey", "--show", "pass either --show, or both --photos and --out")
@@ -92,7 +92,7 @@ def grey(
         from calib.photographs import photographs
 
         turns = AngleRange(black_deg, white_deg)
-        pictures = photographs(photos)
+        pictures = photographs(photos, colour=True)
         _report(lut_from_photographs(out, pictures, stack, panel=panel, source=str(photos), turns=turns), as_json)
         return
     from calib.display import grey_layers, open_display, show_until_key

@@ -8,6 +8,8 @@ the patches in a photograph.
 If the other panels are at zero, a panel with phase p between crossed polarizers shows dark + range·sin²(pi/2·p)
 (EyeReal, (4)). Photographs cannot show by how much black and full white turn the polarization. Unless these angles are
 given (`AngleRange`), black is taken for phase 0 and full white for phase 1.
+
+Each channel of a panel with colour filters has its own curve, measured by the camera's channel of the same colour.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ from calib.detect_marks import find_marks
 from runtime.errors import InputError
 from runtime.optics.malus import phase_from_intensity
 from runtime.optics.stack import PanelStack
+from runtime.panels.lut import COLUMNS
 from runtime.records import F64, U8
 from runtime.support.artifacts import write_text
 
@@ -123,34 +126,57 @@ def lut_from_photographs(
     source: str,
     turns: AngleRange | None = None,
 ) -> dict[str, Any]:
-    """Measure a panel's grey curve from photographs (names and grey pixels) of its chart, and write the
-    LUT as CSV. `turns` are the panel's angles at black and full white, by default 0 and 90 degrees. Raises InputError.
+    """Measure a panel's grey curves from photographs of its chart, and write the LUT as CSV.
+
+    Photographs are names and pixels, grey or RGB. RGB gives a curve for each channel, but one for a panel without
+    filters. `turns` are the panel's angles at black and full white, by default 0 and 90 degrees. Raises InputError.
     """
-    measured = [histograms(picture, stack, panel, source=f"{source}, {name}") for name, picture in pictures]
-    intensity, residual = measure(measured, stack, panel, source=source)
+    measured = []
+    for name, picture in pictures:
+        if picture.ndim == 3 and stack.is_grey(panel):
+            picture = np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), np.uint8)
+        measured.append(histograms(picture, stack, panel, source=f"{source}, {name}"))
+    colours = COLUMNS[1:] if len(measured[0]) == 3 else ("grey",)
+    fits = [
+        measure([one[channel] for one in measured], stack, panel, source=f"{source}, {colour}")
+        for channel, colour in enumerate(colours)
+    ]
+    intensity, residual = np.squeeze(np.stack([fit for fit, _ in fits], axis=1)), max(error for _, error in fits)
     write_lut(out, intensity, turns or AngleRange())
     return {"file": str(out), "grey": GREYS, "intensity": intensity, "residual": residual}
 
 
 def write_lut(out: Path, intensity: F64, turns: AngleRange) -> None:
     """Write 256 rows of phase and grey (0 to 1), given the intensities (13,) of `GREYS` from 0 (black) to
-    1 (white). Phases out of the panel's range get its nearest grey.
+    1 (white), or of phase, red, green and blue, given those by channel (13, 3). Phases out of the panel's range get its
+    nearest grey.
     """
+    rows = np.linspace(0.0, 1.0, LUT_ROWS)
+    curves = np.atleast_2d(intensity.T)
+    table = np.column_stack([rows, *(_inverted(one, rows, turns) for one in curves)])
+    header = COLUMNS if len(curves) == 3 else ("phase", "grey")
+    text = "".join(",".join(f"{value:.6f}" for value in row) + "\n" for row in table)
+    write_text(out, ",".join(header) + "\n" + text)
+
+
+def _inverted(intensity: F64, phases: F64, turns: AngleRange) -> F64:
+    """Return the greys at which a panel has these phases, given the intensities (13,) of `GREYS`."""
     # The square root of the intensity is smooth at both ends, for bare panels and for monitors with a tone curve.
     root = PchipInterpolator(np.array(GREYS) / 255, np.sqrt(np.maximum.accumulate(intensity)))
-    fine, rows = np.linspace(0.0, 1.0, 4097), np.linspace(0.0, 1.0, LUT_ROWS)
+    fine = np.linspace(0.0, 1.0, 4097)
     black, white = (float(np.sin(np.radians(angle)) ** 2) for angle in (turns.black_deg, turns.white_deg))
     transmitted = black + (white - black) * np.clip(root(fine), 0.0, 1.0) ** 2
-    greys = np.interp(rows, phase_from_intensity(transmitted, branch=1), fine)
-    text = "".join(f"{phase:.6f},{grey:.6f}\n" for phase, grey in zip(rows, greys, strict=True))
-    write_text(out, "phase,grey\n" + text)
+    return np.asarray(np.interp(phases, phase_from_intensity(transmitted, branch=1), fine))
 
 
 def histograms(picture: U8, stack: PanelStack, panel: int, *, source: str) -> F64:
-    """Return a histogram of the pixels in the middle of each patch (P, 256) of a grey photograph of a
-    panel's chart. Raises InputError.
+    """Return histograms (C, P, 256) of the pixels in the middle of each patch, by channel.
+
+    `picture` (h, w) or (h, w, 3) is a photograph of a panel's chart. Raises InputError.
     """
-    seen = find_marks(picture, stack, name="")
+    grey = picture if picture.ndim == 2 else np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), np.uint8)
+    picture = np.atleast_3d(picture)
+    seen = find_marks(grey, stack, name="")
     mine, marks_seen = seen.panel == panel, seen.marks[panel]
     if marks_seen < MIN_MARKS:
         problem = (
@@ -167,12 +193,12 @@ def histograms(picture: U8, stack: PanelStack, panel: int, *, source: str) -> F6
         column, row = np.rint(places).astype(int).T
         if min(column.min(), row.min()) < 0 or column.max() >= picture.shape[1] or row.max() >= picture.shape[0]:
             raise InputError(source, "", "does not show the whole chart; move back")
-        rows.append(np.bincount(picture[row, column], minlength=256) / len(row))
-    counts = np.array(rows)
+        rows.append([np.bincount(channel, minlength=256) / len(row) for channel in picture[row, column].T])
+    counts = np.array(rows).transpose(1, 0, 2)
     white = np.array([patch.grey == 255 for patch in patches(stack, panel)])
-    if counts[white, 253:].sum(axis=1).mean() > CLIPPED:
+    if counts[:, white, 253:].sum(axis=2).mean(axis=1).max() > CLIPPED:
         raise InputError(source, "", "is overexposed (white is clipped); reduce the exposure")
-    if (counts[white] @ np.arange(256)).mean() < 60:
+    if (counts[:, white] @ np.arange(256)).mean(axis=1).min() < 60:
         raise InputError(source, "", "is too dark; increase the exposure")
     return counts
 

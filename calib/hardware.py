@@ -26,7 +26,7 @@ from runtime.sensor.registry import open_sensor
 
 Poll = Callable[[], Key | None]
 Say = Callable[[str], None]
-Named = tuple[str, U8]  # name and pixels (h, w) of a photograph
+Named = tuple[str, U8]  # name and pixels of a photograph: (h, w), or (h, w, 3) of a grey chart
 Sample = tuple[int, EyePoints | None, str]  # capture time in ns, eyes in the sensor frame, the sensor's serial number
 POLL_NS = 20 * NS_PER_MS  # interval between polls for keys and samples
 CARD_CHARACTERS = 32  # maximum number of characters per line on an identity card
@@ -101,7 +101,7 @@ class SetupHardware:
                     )
         finally:
             self.let_go()
-        return photographs(folder)
+        return photographs(folder, colour=panel is not None)
 
     def open_sensor(self, settings: Settings) -> str:
         """Start the sensor, wait until it works, and return its name and serial number. Raises InputError."""

@@ -62,7 +62,7 @@ class SimulatedHardware(SetupHardware):
             raise InputError(
                 folder, "", "contains no photographs because the display is simulated; press n to skip this step"
             )
-        return photographs(folder)
+        return photographs(folder, colour=panel is not None)
 
     def open_sensor(self, settings: Settings) -> str:
         return "a simulated sensor, placed as in the built-in recording"

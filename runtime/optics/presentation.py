@@ -2,8 +2,8 @@
 
 `panel_draws` turns a frame into a record for each panel. Everything that draws panels samples by these records and
 decides nothing itself: `shown_picture` (the reference), the shader (panels/presentation.py), the processor
-(panels/processor.py, kernels/panels.cpp) and the browser (browser/assets/display.js). A table of frames tests all four
-(tests/panels/test_presentation_table.py).
+(panels/processor.py, kernels/panels.cpp) and the browser (browser/assets/display.js). A table of frames tests all four,
+the browser without panels' own settings, which it does not have (tests/panels/test_presentation_table.py).
 
 The monitor's pixel with centre s shows the layer's point p = layer_from_screen·s, or the value 0 if p is outside the
 layer. There, the solution is read at

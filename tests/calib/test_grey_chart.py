@@ -54,10 +54,25 @@ def test_two_photographs_tell_a_panels_curve_without_knowing_the_cameras(
     assert np.abs(shown - np.sin(np.pi / 2 * wanted) ** 2).max() < 0.03
 
 
+def test_colour_photographs_tell_each_channels_curve(tmp_path: Path, pictures: list[np.ndarray]) -> None:
+    def blue_phase_of(grey: np.ndarray) -> np.ndarray:
+        return grey**0.7
+
+    other = photographs(blue_phase_of)
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for number, (green, outer) in enumerate(zip(pictures, other, strict=True)):
+        cv2.imwrite(str(folder / f"{number}.png"), np.dstack([outer, green, green]))  # blue, green, red
+    answered(app, "grey", "--photos", folder, "--panel", PANEL, "--out", tmp_path / "lut.csv")
+    lut, wanted = measured_curve(tmp_path / "lut.csv").astype(float), np.sin(np.pi / 2 * np.linspace(0, 1, 256)) ** 2
+    for channel, curve in enumerate((phase_of, phase_of, blue_phase_of)):
+        assert np.abs(np.sin(np.pi / 2 * curve(lut[:, channel])) ** 2 - wanted).max() < 0.03
+
+
 def test_a_curve_that_falls_is_told_and_not_swallowed() -> None:
     falling = photographs(lambda grey: np.where(grey < 0.6, grey, grey - 0.25))
     with pytest.raises(match=r"grey 170 is darker than grey 149"):
-        measure([histograms(picture, STACK, PANEL, source="p") for picture in falling], STACK, PANEL, source="p")
+        measure([histograms(picture, STACK, PANEL, source="p")[0] for picture in falling], STACK, PANEL, source="p")
 
 
 @pytest.mark.parametrize(("gain", "why"), [(1.25, "overexposed"), (0.02, "marks|too dark")])

@@ -30,6 +30,7 @@ class Row:
     coarser: int = 1
     settings: PanelSettings = field(default_factory=PanelSettings)
     stack: PanelStack = STACK
+    each: tuple[PanelSettings, ...] = ()  # a panel's own, in place of `settings`; its mounting is the same
 
     def frame(self) -> PanelFrame:
         size = self.stack.height_px // self.coarser, self.stack.width_px // self.coarser
@@ -41,13 +42,17 @@ class Row:
         )  # fmt: skip
 
     @property
+    def panels(self) -> tuple[PanelSettings, ...]:
+        return self.each or (self.settings,) * self.stack.count
+
+    @property
     def screen_px(self) -> tuple[int, int]:
         size_px = self.stack.width_px, self.stack.height_px
         return size_px[::-1] if self.settings.rotation_deg in (90, 270) else size_px
 
     def mounts(self) -> tuple[Mount, ...]:
         layer_px = self.stack.width_px, self.stack.height_px
-        return (mount_of(self.settings, screen_px=self.screen_px, layer_px=layer_px),) * self.stack.count
+        return tuple(mount_of(panel, screen_px=self.screen_px, layer_px=layer_px) for panel in self.panels)
 
     def reference(self, between: Interpolation) -> U8:
         """(N, h, w, 3) what the monitors show."""

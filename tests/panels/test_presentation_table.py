@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import moderngl
 import numpy as np
@@ -19,10 +20,9 @@ from tests.panels.drawn import DrawnPanels, ProcessorDrawnPanels, ReadPanels
 NAMES = pytest.mark.parametrize("name", table.ROWS)
 
 
-def drawn(name: str, context: moderngl.Context | None) -> U8:
+def drawn(row: table.Row, context: moderngl.Context | None) -> U8:
     """(N, h, w, 3) what the shader shows, or without a context the processor."""
-    row = table.ROWS[name]
-    size_px, panels = (row.stack.width_px, row.stack.height_px), (row.settings,) * row.stack.count
+    size_px, panels = (row.stack.width_px, row.stack.height_px), row.panels
     sink: ReadPanels
     if context is None:
         sink = ProcessorDrawnPanels(clock=SimulatedClock(), size_px=size_px, panels=panels)
@@ -36,12 +36,12 @@ def drawn(name: str, context: moderngl.Context | None) -> U8:
 
 @NAMES
 def test_the_shader_shows_what_the_reference_shows(gl: moderngl.Context, name: str) -> None:
-    assert table.agrees(drawn(name, gl), table.ROWS[name].reference(Interpolation.CUBIC))
+    assert table.agrees(drawn(table.ROWS[name], gl), table.ROWS[name].reference(Interpolation.CUBIC))
 
 
 @NAMES
 def test_the_processor_shows_what_the_reference_shows(name: str) -> None:
-    shown, expected = drawn(name, None), table.ROWS[name].reference(processor.BETWEEN)
+    shown, expected = drawn(table.ROWS[name], None), table.ROWS[name].reference(processor.BETWEEN)
     if table.ROWS[name].coarser >= processor.COARSE and table.ROWS[name].move_m != table.STILL and "mixed" not in name:
         shown, expected = shown[:, ::2, ::2], expected[:, ::2, ::2]  # the pixels between are averages
     assert table.agrees(shown, expected)
@@ -57,6 +57,23 @@ def test_rows_differ_from_the_solution_as_it_is(name: str) -> None:
     assert changes == (name != "still")
     if changes and row.coarser == 1 and row.screen_px == (row.stack.width_px, row.stack.height_px):
         assert np.abs(row.reference(Interpolation.CUBIC)[0].astype(int) - frame.solved[0, ..., :3]).mean() > 3
+
+
+@pytest.mark.parametrize("by", ["shader", "processor"])
+def test_each_panel_has_its_own_curve_for_each_channel(request: pytest.FixtureRequest, tmp_path: Path, by: str) -> None:
+    codes = np.linspace(0, 1, 256)
+    exponents = np.array([[0.6, 1.0, 1.8], [1.8, 0.6, 1.0], [1.4, 1.8, 0.7]])  # by panel and channel
+    for n, powers in enumerate(exponents):
+        rows = np.column_stack([codes, *(codes**power for power in powers)])
+        np.savetxt(tmp_path / f"{n}.csv", rows, delimiter=",", header="phase,red,green,blue", comments="")
+    panels = tuple(PanelSettings(lut=str(tmp_path / f"{n}.csv")) for n in range(3))
+    row = table.Row(table.STILL, relief=False, each=panels)
+    shown = drawn(row, request.getfixturevalue("gl") if by == "shader" else None)
+    solved = row.frame().solved
+    assert solved is not None
+    expected = np.rint(255 * (solved[..., :3] / 255) ** exponents[:, None, None]).astype(np.uint8)
+    assert table.agrees(shown, expected)
+    assert table.agrees(row.reference(Interpolation.CUBIC), expected)
 
 
 @pytest.mark.parametrize("flatness", [-0.5, 1.5])
