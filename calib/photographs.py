@@ -18,7 +18,7 @@ SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
 
 
 def photographs(folder: Path, *, colour: bool = False) -> Iterator[tuple[str, U8]]:
-    """Yield each photograph in a folder, by name: its name and pixels (`read_photograph`). Raises InputError."""
+    """Yield the name and pixels of each photograph in a folder, by name. Raises InputError."""
     if not untrusted_input.is_there(folder, folder=True):
         raise InputError(folder, "", "is not a folder")
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
