@@ -249,7 +249,7 @@ def solve(
         raise TypeError(f"{unknown[0]}: unknown argument")
     pair = _checked(left, right, stack=stack, eyes_m=eyes_m, fov_deg=fov_deg, cameras=cameras)
     steps = how.get("steps")
-    steps = None if steps is None else _whole("steps", steps, STEPS_MOST)
+    steps = None if steps is None else _whole("steps", steps, 0, STEPS_MOST)
     floats = how.get("floats", False)
     if not isinstance(floats, bool):
         raise ValueError(f"floats: must be True or False, not {floats!r}")
@@ -355,9 +355,7 @@ def _on_real_panels(pair: _Pair, layers: U8, panels: RealPanels, how: Measuring)
 
 
 def _measured(pair: SolvedPair, how: Measuring) -> PairQuality:
-    """Measure all or the requested figures. Raises TypeError for an unknown option, ValueError for its value."""
-    if unknown := sorted(how.keys() - Measuring.__annotations__.keys()):
-        raise TypeError(f"{unknown[0]}: unknown argument; use {' or '.join(Measuring.__annotations__)}")
+    """Measure all or the requested figures. Raises as `_options` does."""
     if not how:
         return pair.quality
     sigmas, every = _options(pair.pictures, how)
@@ -365,15 +363,17 @@ def _measured(pair: SolvedPair, how: Measuring) -> PairQuality:
 
 
 def _options(pictures: Sequence[Picture], how: Measuring) -> tuple[list[float], int]:
-    """Return the tracking errors and the step between measured pixels. Raises ValueError if one is out of range."""
+    """Return the tracking errors and the step between measured pixels. Raises TypeError for an unknown option, and
+    ValueError if a value is out of range.
+    """
+    if unknown := sorted(how.keys() - Measuring.__annotations__.keys()):
+        raise TypeError(f"{unknown[0]}: unknown argument; use {' or '.join(Measuring.__annotations__)}")
     sigmas_mm, every = how.get("sigmas_mm", SIGMAS_MM), how.get("every", 1)
     if not isinstance(sigmas_mm, Sequence) or not sigmas_mm:
         raise ValueError(f"sigmas_mm: must be a sequence of tracking errors in mm such as (1,), not {sigmas_mm!r}")
     sigmas = [_number("sigmas_mm", sigma_mm, 0.0, 1000.0, "mm") for sigma_mm in sigmas_mm]
     most = min(pictures[0].shape[:2]) // EVERY_LEAST
-    if isinstance(every, bool) or not isinstance(every, int | np.integer) or not 1 <= every <= most:
-        raise ValueError(f"every: must be a whole number of pixels from 1 to {most}, not {every!r}")
-    return sigmas, int(every)
+    return sigmas, _whole("every", every, 1, most)
 
 
 def camera(eye_m: Sequence[float] | F64, *, width_px: int, height_px: int, fov_deg: float = 40.0) -> F64:
@@ -479,10 +479,10 @@ def _loaded(model: str, stack: PanelStack) -> Predictor:
     return load_predictor(model, stack)
 
 
-def _whole(name: str, value: Any, most: int) -> int:
-    """Return a whole number from 0 to `most`. Raises ValueError for any other value."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 0 <= value <= most:
-        raise ValueError(f"{name}: must be a whole number from 0 to {most}, not {value!r}")
+def _whole(name: str, value: Any, least: int, most: int) -> int:
+    """Return a whole number from `least` to `most`. Raises ValueError for any other value."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not least <= value <= most:
+        raise ValueError(f"{name}: must be a whole number from {least} to {most}, not {value!r}")
     return int(value)
 
 

@@ -238,12 +238,9 @@ def _wave_taper(geometry: Geometry, raster: PlaneRaster, middle_m: F64) -> F32:
     are projected to the centre panel along rays from `middle_m`, the point between the eyes.
     """
     stack, kept = geometry.stack, geometry.kept
-    centre = stack.panel(stack.count // 2)
-    share = (centre.x_m - raster.x_m) / (middle_m[0] - raster.x_m)
-    y_m = raster.left_m + (np.arange(raster.width_px) + 0.5) * raster.pitch_u_m
-    z_m = raster.top_m - (np.arange(raster.height_px) + 0.5) * raster.pitch_v_m
-    u = (y_m + (middle_m[1] - y_m) * share - centre.left_m) / centre.pitch_u_m
-    v = (centre.top_m - z_m - (middle_m[2] - z_m) * share) / centre.pitch_v_m
+    to_centre = raster.to(stack.panel(stack.count // 2), middle_m)
+    u = to_centre[0, 0] * (np.arange(raster.width_px) + 0.5) + to_centre[0, 2]
+    v = to_centre[1, 1] * (np.arange(raster.height_px) + 0.5) + to_centre[1, 2]
     across = taper(u, kept.u0, kept.u1, stack.width_px, geometry.taper_px[0])
     down = taper(v, kept.v0, kept.v1, stack.height_px, geometry.taper_px[1])
     return np.asarray(across * down[:, None], np.float32)
