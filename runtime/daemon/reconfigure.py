@@ -10,7 +10,7 @@ from runtime.config import PLACING, ContentSettings, Settings
 from runtime.content.placed import placed_source, placing_of
 from runtime.content.registry import Opener, prepare_content
 from runtime.errors import PhasestackError, Stopped
-from runtime.frame.run_state import SceneCell
+from runtime.frame.solver import Solver
 from runtime.model.base import warm_up
 from runtime.model.buffers import LayerSlots
 from runtime.model.device import SolverBackend
@@ -52,7 +52,7 @@ class Reconfiguration:
         """Cancel the change and discard anything loaded."""
         self.abandoned = True
 
-    def advance(self, cell: SceneCell, context: Any, backend: SolverBackend) -> bool:
+    def advance(self, solver: Solver, context: Any, backend: SolverBackend) -> bool:
         """Adopt the loaded parts between steps. Returns True once the change is adopted, refused or
         discarded.
         """
@@ -67,7 +67,7 @@ class Reconfiguration:
                 if predictor is not None:
                     predictor.close()
             else:
-                self._take_over(cell, opener, predictor, context=context, backend=backend)
+                self._take_over(solver, opener, predictor, context=context, backend=backend)
         give_back()  # the replaced parts' memory
         return True
 
@@ -98,7 +98,7 @@ class Reconfiguration:
 
     def _take_over(
         self,
-        cell: SceneCell,
+        solver: Solver,
         opener: Opener | None,
         predictor: Predictor | None,
         *,
@@ -106,7 +106,7 @@ class Reconfiguration:
         backend: SolverBackend,
     ) -> None:
         """Replace the solver's state and close replaced parts, or keep it and set `problem` if the new ones fail."""
-        now, moved = cell.state.settings.content, {}
+        now, moved = solver.state.settings.content, {}
         if now.scene == self.settings.content.scene:  # another scene is placed as configured
             moved = moved_since(self._old.content, now)
         placed = self.settings.content.model_copy(update=moved)
@@ -131,7 +131,7 @@ class Reconfiguration:
             undo.pop_all()
             if predictor is not None:
                 predictor.close()  # it was warmed up on the processor
-        before = cell.replace(**changes)
+        before = solver.replace(**changes)
         if opener is not None:
             before.content.close()
         if predictor is not None:

@@ -29,8 +29,7 @@ from runtime.frame.messages import (
     Skip,
     SolverUpdate,
 )
-from runtime.frame.run_state import SceneCell
-from runtime.frame.solver import Solver
+from runtime.frame.solver import SceneState, Solver
 from runtime.frame.targets import drawn
 from runtime.model.backends import Choice, Wanted, choose
 from runtime.model.base import trial_eyes_m, warm_up
@@ -88,15 +87,8 @@ class RunningSolver:
             undo.pop_all()
             loaded.close()
         self.context = context
-        self.run = SceneCell(
-            settings,
-            content=content,
-            predictor=predictor,
-            version=setup.version,
-            scene=setup.scene,
-            first_number=setup.first_number,
-        )
-        self.solver = Solver(self.run, stack, timed=not setup.simulated)
+        state = SceneState(setup.version, setup.scene, settings, content, predictor)
+        self.solver = Solver(state, stack, first_number=setup.first_number, timed=not setup.simulated)
         self._calibrated = None if setup.costs is None else (predictor, setup.costs)
         self._change: tuple[int, Reconfiguration] | None = None
         self._told = ""  # progress of the change, as last reported
@@ -111,7 +103,7 @@ class RunningSolver:
             match order:
                 case ChangeSettings():
                     change = Reconfiguration(
-                        order.settings, self.run.state.settings, stack,
+                        order.settings, self.solver.state.settings, stack,
                         reload_content=order.reload_content, slots=self._slots,
                     )  # fmt: skip
                     self._change, self._told = (order.number, change), ""
@@ -123,12 +115,10 @@ class RunningSolver:
                 case Skip():
                     answers.append(self._done(order.number, partial(self._skip, order.time_ns)))
                 case Draw():
-                    answers.append(
-                        drawn(order, self.run.state.content, scene=self.run.state.scene, stack=self.solver.stack)
-                    )
+                    answers.append(drawn(order, self.solver.state.content, scene=self.solver.state.scene, stack=stack))
         if self._change is not None:
             number, change = self._change
-            if change.advance(self.run, self.context, self.backend.backend):
+            if change.advance(self.solver, self.context, self.backend.backend):
                 self._change = None
                 answers.append(Done(number, change.problem, None if change.problem else self.facts))
             elif change.progress != self._told:
@@ -155,19 +145,19 @@ class RunningSolver:
         return Done(number, problem, None if problem else self.facts)
 
     def _move(self, placing: Mapping[str, Any]) -> str:
-        state = self.run.state
+        state = self.solver.state
         settings = changed(state.settings, "content", dict(placing), source="place")
-        self.run.replace(settings=settings, content=placed_source(state.content, placing_of(settings.content)))
+        self.solver.replace(settings=settings, content=placed_source(state.content, placing_of(settings.content)))
         return ""
 
     def _skip(self, time_ns: int) -> str:
-        if self.run.state.content.skip(time_ns=time_ns):
+        if self.solver.state.content.skip(time_ns=time_ns):
             return ""
         return "there is no next entry because the scene is not a playlist or is already at its last entry"
 
     @property
     def facts(self) -> Facts:
-        state, predictor = self.run.state, self.run.state.predictor
+        state, predictor = self.solver.state, self.solver.state.predictor
         return Facts(
             state.version,
             state.scene,
@@ -183,7 +173,7 @@ class RunningSolver:
         )
 
     def live(self, time_ns: int) -> Live:
-        content = self.run.state.content
+        content = self.solver.state.content
         return Live(
             content.problem,
             content.program,
@@ -193,10 +183,12 @@ class RunningSolver:
         )
 
     def simulated_costs(self) -> Costs:
-        return simulated_costs(self.run.state.settings.loop.simulated_stage_ms, self.run.state.predictor.reductions)
+        return simulated_costs(
+            self.solver.state.settings.loop.simulated_stage_ms, self.solver.state.predictor.reductions
+        )
 
     def first_costs(self, *, time_ns: int) -> Mapping[int, Mapping[str, float]]:
-        predictor = self.run.state.predictor
+        predictor = self.solver.state.predictor
         if self._calibrated is None or self._calibrated[0] is not predictor:
             self._calibrated = predictor, self._trial_costs(predictor, time_ns=time_ns)
         return self._calibrated[1]
@@ -219,7 +211,7 @@ class RunningSolver:
     def close(self) -> None:
         if self._change is not None:
             self._change[1].abandon()
-        state = self.run.state
+        state = self.solver.state
         own = [leave_context, self.context.release] if self._owns_context else []
         for release in (state.content.close, state.predictor.close, self.backend.backend.close, *own):
             try:

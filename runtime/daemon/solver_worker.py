@@ -101,7 +101,7 @@ class _Serving:
         self._live = self._parts.live(time.monotonic_ns())
         bare = SolverUpdate(_bare(solution), _bare(update.flat), update.missing)
         places = self._handed_over(solution), self._handed_over(update.flat)
-        info = self._parts.run.state.content.info
+        info = self._parts.solver.state.content.info
         self._parent.send(Stepped(bare, *places, 0 if is_first else took_ns, self._costs.costs(), self._live, info))
 
     def _handed_over(self, solution: Solution | None) -> Slot | None:

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import count
 from time import perf_counter_ns
+from typing import Any
 
 import numpy as np
 
 from runtime.clock import NS_PER_MS, Stopwatch
-from runtime.content.base import View
+from runtime.config import Settings
+from runtime.content.base import ContentSource, View
 from runtime.errors import ContentFailure, ContextLost, ModelFailure
 from runtime.frame.messages import SolverUpdate
 from runtime.frame.meter import SolutionMeter
 from runtime.frame.policy import FramePolicy, SolutionKey
-from runtime.frame.run_state import SceneCell, SceneState
 from runtime.model.geometry import TargetView
 from runtime.model.job import Job, SolveWindow
+from runtime.model.predictor import Predictor
 from runtime.model.targets import flat_layers
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import raster_from_stack
@@ -31,12 +34,26 @@ log = logging.getLogger("phasestack.solver")
 FLAT_EYE_M = (0.7, 0.0, 0.0)  # the flat picture's viewpoint until a viewer has been seen
 
 
-class Solver:
-    """Computes at most one solution or flat picture in each step, with the state at its beginning."""
+@dataclass(frozen=True, slots=True)
+class SceneState:
+    """The settings, content and model that a solver uses together."""
 
-    def __init__(self, run: SceneCell, stack: PanelStack, *, timed: bool = True) -> None:
-        """Create a solver. On a simulated clock, `timed` is False, and `model.budget_ms` does not apply."""
-        self.run, self.stack, self._timed = run, stack, timed
+    version: int  # unique among the states of a run
+    scene: int  # changes whenever the content is replaced or moved
+    settings: Settings
+    content: ContentSource
+    predictor: Predictor
+
+
+class Solver:
+    """Computes at most one solution or flat picture in each step."""
+
+    def __init__(self, state: SceneState, stack: PanelStack, *, first_number: int = 1, timed: bool = True) -> None:
+        """Create a solver whose solutions are numbered from `first_number`. On a simulated clock, `timed` is False, and
+        `model.budget_ms` does not apply.
+        """
+        self.state, self.stack, self._timed = state, stack, timed
+        self._numbers = count(first_number)
         self.measured = Measured()  # times and errors measured for each item of the plan
         self.plan: Plan | None = None
         self._planned_for: tuple[int, tuple[bool, ...]] | None = None
@@ -50,12 +67,18 @@ class Solver:
         self._middle_m: F64 = np.array(FLAT_EYE_M)
         self._missing: dict[str, str] = {}
 
-    def step(self, request: SolveRequest, state: SceneState | None = None) -> SolverUpdate:
-        """Carry out a request, with the latest state unless given, and return the results. If the content or
-        the model fails, the update names the failed part, and all earlier results remain valid. Raises ContextLost,
-        after which this solver can no longer be used.
+    def replace(self, **changes: Any) -> SceneState:
+        """Replace fields of the state and return the old one, whose replaced parts the caller must close."""
+        before = self.state
+        scene = before.scene + (changes.get("content", before.content) is not before.content)
+        self.state = replace(before, version=before.version + 1, scene=scene, **changes)
+        return before
+
+    def step(self, request: SolveRequest) -> SolverUpdate:
+        """Carry out a request and return the results. If the content or the model fails, the update names the failed
+        part, and all earlier results remain valid. Raises ContextLost, after which this solver can no longer be used.
         """
-        state = state or self.run.state
+        state = self.state
         self._replan(state, request.eyes_m)
         time_ns = request.time_ns
         try:
@@ -88,7 +111,7 @@ class Solver:
         """Draw and solve once in one step, discard the result, and return the stage times in ms. Raises
         ContentFailure, ModelFailure, or ContextLost, after which this solver can no longer be used.
         """
-        state, watch = self.run.state, Stopwatch()
+        state, watch = self.state, Stopwatch()
         plan = state.settings.plan
         job = drawn_job(
             state.predictor, state.content, eyes_m,
@@ -138,7 +161,7 @@ class Solver:
         self._solved = SolutionKey(state.version, revision, eyes_m, effort)
         self._middle_m = eyes_m.mean(axis=0)
         solution = Solution(
-            self.run.next_number(),
+            next(self._numbers),
             prediction.layers,
             eyes_m,
             request.time_ns,
@@ -191,7 +214,7 @@ class Solver:
             self._missing.pop("content", None)
             self._flat = SolutionKey(state.version, revision, None, episode=self._policy.episode)
         watch.lap("render")
-        flat = Solution(self.run.next_number(), layers, None, time_ns, stage_ms=watch.stage_ms)
+        flat = Solution(next(self._numbers), layers, None, time_ns, stage_ms=watch.stage_ms)
         return SolverUpdate(flat=flat, missing=dict(self._missing))  # the model's fault is not over
 
     @property
@@ -206,11 +229,7 @@ class Solver:
         made_for = (state.version, seeing)
         if made_for != self._planned_for:
             self._planned_for = made_for
-            self.plan = self._plan_of(state, seeing, self.measured)
-
-    @staticmethod
-    def _plan_of(state: SceneState, seeing: tuple[bool, ...], measured: Measured) -> Plan:
-        return make_plan(state.content.info, state.settings, seeing=seeing, measured=measured)
+            self.plan = make_plan(state.content.info, state.settings, seeing=seeing, measured=self.measured)
 
     def _failed(self, part: str, error: BaseException, *, expected: type[Exception]) -> dict[str, str]:
         self._missing[part] = str(error).splitlines()[0] if str(error) else type(error).__name__

@@ -129,7 +129,7 @@ class Rig:
         self.plan.mend()
         self.presenter.panels, predictor = self._well
         if predictor is not None:
-            self.parts.run.replace(predictor=predictor)
+            self.parts.solver.replace(predictor=predictor)
 
     def __exit__(self, *exception: object) -> None:
         self._cleanup.close()
@@ -148,12 +148,12 @@ class Rig:
     @property
     def content(self) -> Any:
         """Content currently drawn."""
-        return self.parts.run.state.content
+        return self.parts.solver.state.content
 
     @property
     def predictor(self) -> Any:
         """Predictor currently in use."""
-        return self.parts.run.state.predictor
+        return self.parts.solver.state.predictor
 
     def refresh_until(self, wanted: str | Callable[[], Any], *, within_s: float = 90.0) -> RefreshAccount:
         """Refreshes until the state is called this, or until it holds. Raises AssertionError where it never does."""
@@ -207,7 +207,7 @@ class Rig:
     def break_predictor(self) -> BreakablePredictor:
         """The model, from now on in the hands of the test."""
         predictor = BreakablePredictor(self.predictor)
-        self.parts.run.replace(predictor=predictor)
+        self.parts.solver.replace(predictor=predictor)
         return predictor
 
 

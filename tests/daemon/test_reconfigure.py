@@ -15,7 +15,7 @@ from runtime.daemon import reconfigure
 from runtime.daemon.reconfigure import Reconfiguration, ready_predictor
 from runtime.daemon.solver_parts import RunningSolver, SolverSetup
 from runtime.errors import ContentFailure
-from runtime.frame.run_state import SceneState
+from runtime.frame.solver import SceneState
 from runtime.model.base import warm_up
 from runtime.records import SolveRequest
 from runtime.support.gl import offscreen_context
@@ -76,13 +76,13 @@ class Bench:
         self.stack = self.settings.stack.stack()
         self.context = offscreen_context()
         self.parts = RunningSolver(SolverSetup(self.settings, self.stack, simulated=True), context=self.context)
-        state = self.parts.run.state
+        state = self.parts.solver.state
         self.first_content, self.first_model = Lent(state.content), Lent(state.predictor)
-        self.parts.run.replace(content=self.first_content, predictor=self.first_model)
+        self.parts.solver.replace(content=self.first_content, predictor=self.first_model)
 
     @property
     def state(self) -> SceneState:
-        return self.parts.run.state
+        return self.parts.solver.state
 
     def change(self, new: Settings, **how: Any) -> Reconfiguration:
         return Reconfiguration(new, self.state.settings, self.stack, **how)
@@ -90,7 +90,7 @@ class Bench:
     def advance(self, change: Reconfiguration) -> None:
         """Until it is over."""
         parts = self.parts
-        adopts = partial(change.advance, parts.run, parts.context, parts.backend.backend)
+        adopts = partial(change.advance, parts.solver, parts.context, parts.backend.backend)
         assert eventually(adopts, within_s=PATIENCE_S)
 
     def solve(self) -> Any:

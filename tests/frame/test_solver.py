@@ -16,8 +16,7 @@ from runtime.content.procedural import ProceduralSource
 from runtime.content.registry import open_content
 from runtime.content.scenes import Scene, Thing
 from runtime.errors import ContentFailure, ModelFailure
-from runtime.frame.run_state import SceneCell
-from runtime.frame.solver import Solver, SolverUpdate
+from runtime.frame.solver import SceneState, Solver, SolverUpdate
 from runtime.model.predictor import Predictor
 from runtime.plan.drawing import drawn_job
 from runtime.records import U8, Effort, SolveRequest
@@ -30,28 +29,27 @@ def wish(eyes_m: Any = EYES, *, time_ns: int = 0, sigma_m: float = 0.001, flat: 
 
 
 @pytest.fixture
-def cell(content: ContentSource, predictor: Predictor) -> SceneCell:
+def state(content: ContentSource, predictor: Predictor) -> SceneState:
     settings = Settings.model_validate({"model": {"name": "fast", "threads": 1}})
-    return SceneCell(settings, content=content, predictor=predictor)
+    return SceneState(0, 1, settings, content, predictor)
 
 
 @pytest.fixture
-def solver(cell: SceneCell) -> Solver:
+def solver(state: SceneState) -> Solver:
     """With its flat picture drawn."""
-    made = Solver(cell, SMALL)
+    made = Solver(state, SMALL)
     assert made.step(wish(None, flat=True)).flat is not None
     return made
 
 
-def test_the_flat_picture_is_for_eyes_anywhere_and_equal_along_every_ray(cell: SceneCell) -> None:
-    flat = Solver(cell, SMALL).step(wish(None, flat=True)).flat
+def test_the_flat_picture_is_for_eyes_anywhere_and_equal_along_every_ray(state: SceneState) -> None:
+    flat = Solver(state, SMALL).step(wish(None, flat=True)).flat
     assert flat.solved_for_m is None
     assert flat.layers.shape == (3, 108, 192, 4)
     assert set(flat.stage_ms) == {"render"}
 
 
-def test_a_solution_is_the_model_s_answer_to_the_content_s_pictures(solver: Solver, cell: SceneCell) -> None:
-    state = cell.state
+def test_a_solution_is_the_model_s_answer_to_the_content_s_pictures(solver: Solver, state: SceneState) -> None:
     solution = solver.step(wish(time_ns=77)).solution
     job = drawn_job(state.predictor, state.content, EYES, time_ns=77, trimmed=True)
     layers = state.predictor.solve(replace(job, eye_sigma_m=solution.eye_sigma_m)).layers
@@ -62,12 +60,12 @@ def test_a_solution_is_the_model_s_answer_to_the_content_s_pictures(solver: Solv
     assert solution.layers.std() > 5
 
 
-def test_a_solver_that_is_made_anew_gives_no_number_a_second_time(solver: Solver, cell: SceneCell) -> None:
+def test_another_solver_of_the_run_gives_no_number_a_second_time(solver: Solver) -> None:
     """Sinks know layers by their number: the same one for other layers would leave the old ones on the panels."""
     numbers = [solver.step(wish(aside(k / 100))).solution.number for k in range(3)]
-    anew = Solver(cell, SMALL)
-    first = [anew.step(wish(None, flat=True)).flat.number, anew.step(wish()).solution.number]
-    assert min(first) > max(numbers)
+    another = Solver(solver.state, SMALL, first_number=max(numbers) + 1)
+    first = [another.step(wish(None, flat=True)).flat.number, another.step(wish()).solution.number]
+    assert first == [numbers[-1] + 1, numbers[-1] + 2]
 
 
 def test_a_solution_that_is_held_never_changes_whatever_is_solved_after_it(solver: Solver) -> None:
@@ -86,19 +84,19 @@ def test_the_same_eyes_and_content_are_not_solved_for_twice(solver: Solver) -> N
     assert solver.step(wish(aside(0.001))).solution is not None
 
 
-def test_another_state_is_solved_for_with_its_own_parts(solver: Solver, cell: SceneCell, shared_context: Any) -> None:
+def test_another_state_is_solved_for_with_its_own_parts(solver: Solver, shared_context: Any) -> None:
     first = solver.step(wish()).solution
     other = open_content(ContentSettings(scene="texture"), SMALL, shared_context)
-    cell.replace(content=other)
+    solver.replace(content=other)
     second = solver.step(wish()).solution
     assert not np.array_equal(first.layers, second.layers)
     assert solver.step(wish()) == SolverUpdate()
     other.close()
 
 
-def test_content_that_moves_is_solved_for_at_its_instant(solver: Solver, cell: SceneCell, shared_context: Any) -> None:
+def test_content_that_moves_is_solved_for_at_its_instant(solver: Solver, shared_context: Any) -> None:
     moving = open_content(ContentSettings(scene="moving"), SMALL, shared_context)
-    cell.replace(content=moving)
+    solver.replace(content=moving)
     layers = [solver.step(wish(time_ns=t)).solution.layers for t in (0, NS_PER_S // 3)]
     assert not np.array_equal(layers[0], layers[1])
     moving.close()
@@ -109,10 +107,10 @@ def test_less_certain_eyes_get_a_more_tolerant_solution(solver: Solver) -> None:
     assert sigmas == pytest.approx([0.0, 0.001, 0.002, 0.003]), "the tracker's alone"
 
 
-def test_after_its_budget_no_further_step_begins_but_on_a_simulated_clock(cell: SceneCell, solver: Solver) -> None:
+def test_after_its_budget_no_further_step_begins_but_on_a_simulated_clock(solver: Solver) -> None:
     whole = solver.step(wish()).solution.layers.copy()
-    cell.replace(settings=changed(cell.state.settings, "model", {"budget_ms": 1e-3}, source="a test"))
-    limited, simulated = (Solver(cell, SMALL, timed=timed) for timed in (True, False))
+    solver.replace(settings=changed(solver.state.settings, "model", {"budget_ms": 1e-3}, source="a test"))
+    limited, simulated = (Solver(solver.state, SMALL, timed=timed) for timed in (True, False))
     for made in (limited, simulated):
         made.step(wish(None, flat=True))
     assert not np.array_equal(limited.step(wish()).solution.layers, whole)
@@ -141,7 +139,7 @@ def test_a_coarse_solution_is_not_continued_in_place_of_an_earlier_one(solver: S
 OFF_M = np.array([[0.123, 0.43, 0.0], [0.078, 0.47, 0.0]])  # the right eye is 80.6 degrees off the axis
 
 
-def test_an_eye_beside_the_display_gets_the_other_s_picture(solver: Solver, cell: SceneCell) -> None:
+def test_an_eye_beside_the_display_gets_the_other_s_picture(solver: Solver) -> None:
     solution = solver.step(wish(OFF_M)).solution
     assert solution.seeing == (True, False)
     assert np.array_equal(solution.solved_for_m, OFF_M[[0, 0]])
@@ -149,7 +147,7 @@ def test_an_eye_beside_the_display_gets_the_other_s_picture(solver: Solver, cell
     assert solver.step(wish()).solution.seeing == (True, True)
 
 
-def test_the_flat_picture_is_drawn_from_the_middle_of_the_last_eyes(solver: Solver, cell: SceneCell) -> None:
+def test_the_flat_picture_is_drawn_from_the_middle_of_the_last_eyes(solver: Solver) -> None:
     solver.step(wish(aside(0.25)))
     aside_flat = solver.step(wish(None, flat=True)).flat.layers
     solver.step(wish(aside(-0.25)))
@@ -210,11 +208,11 @@ def test_a_flat_picture_does_not_end_the_model_s_fault(
 
 
 def test_where_even_the_flat_picture_fails_a_uniform_one_is_shown(
-    cell: SceneCell, content: ContentSource, monkeypatch: pytest.MonkeyPatch
+    state: SceneState, content: ContentSource, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
         broken(content, "render", ContentFailure("gone"), patch)
-        solver = Solver(cell, SMALL)
+        solver = Solver(state, SMALL)
         step = solver.step(wish(None, flat=True))
         assert step.missing == {"content": "gone"}
         assert np.ptp(step.flat.layers[..., :3], axis=(1, 2)).max() == 0
@@ -239,10 +237,10 @@ def test_a_fault_that_is_over_is_cleared_without_new_work(
     [("demo", "on", True), ("demo", "auto", False), ("flat card", "auto", True), ("pair", "on", False)],
 )
 def test_content_that_qualifies_gets_focus_and_no_other(
-    solver: Solver, cell: SceneCell, shared_context: Any, scene: str, focus: str, gets: bool
+    solver: Solver, shared_context: Any, scene: str, focus: str, gets: bool
 ) -> None:
     """The demo scene reaches behind the rear panel; a pair has no other views."""
-    settings = changed(cell.state.settings, "content", {"focus": focus}, source="test")
+    settings = changed(solver.state.settings, "content", {"focus": focus}, source="test")
     card = shapes.card(0.1, 0.05)
     content = (
         Pair()
@@ -253,7 +251,7 @@ def test_content_that_qualifies_gets_focus_and_no_other(
             context=shared_context,
         )
     )
-    cell.replace(content=content, settings=settings)
+    solver.replace(content=content, settings=settings)
     resting = replace(wish(), eyes_label="rested")
     plain = solver.step(resting).solution
     for _ in range(2):  # the second time, nothing is left to do

@@ -81,7 +81,7 @@ def solver_of(presenter: Presenter) -> SimulatedSolver:
 def model_of(presenter: Presenter) -> Any:
     """The model, which lives in the same process on a simulated clock."""
     parts: Any = solver_of(presenter).parts
-    return parts.run.state.predictor
+    return parts.solver.state.predictor
 
 
 def ask_flat(presenter: Presenter) -> None:
