@@ -49,8 +49,9 @@ class Solver:
     """Computes at most one solution or flat picture in each step."""
 
     def __init__(self, state: SceneState, stack: PanelStack, *, first_number: int = 1, timed: bool = True) -> None:
-        """Create a solver whose solutions are numbered from `first_number`. On a simulated clock, `timed` is False, and
-        `model.budget_ms` does not apply.
+        """Create a solver whose solutions are numbered from `first_number`.
+
+        On a simulated clock, `timed` is False, and `model.budget_ms` does not apply.
         """
         self.state, self.stack, self._timed = state, stack, timed
         self._numbers = count(first_number)
@@ -75,8 +76,10 @@ class Solver:
         return before
 
     def step(self, request: SolveRequest) -> SolverUpdate:
-        """Carry out a request and return the results. If the content or the model fails, the update names the failed
-        part, and all earlier results remain valid. Raises ContextLost, after which this solver can no longer be used.
+        """Carry out a request and return the results.
+
+        If the content or the model fails, the update names the failed part, and all earlier results remain valid.
+        Raises ContextLost, after which this solver can no longer be used.
         """
         state = self.state
         self._replan(state, request.eyes_m)
