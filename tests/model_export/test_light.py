@@ -11,7 +11,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 from model_export.light import FLOOR, Views, light, step, traced  # noqa: E402
-from model_export.scene import draw, random_scene  # noqa: E402
+from model_export.scene import Parallelogram, draw, random_scene  # noqa: E402
 from runtime.optics.stack import PanelStack, Tilt  # noqa: E402
 from runtime.optics.views import image_from_raster, image_from_stack  # noqa: E402
 
@@ -153,3 +153,13 @@ def test_a_step_is_bounded_by_the_curvature_and_its_floor() -> None:
         s = np.pi * sum(values)
         moved = 0.5 * 2 * (1 - np.cos(s)) / 2 * np.sin(s) / (1.5 * np.pi * max(2 * np.sin(s) ** 2, FLOOR * 2)) * 3 / 2
         assert (x - new).numpy() == pytest.approx(np.full((2, 1, 2, 2), moved), abs=1e-12)
+
+
+def test_what_lies_behind_the_eye_is_not_seen() -> None:
+    red = np.zeros((8, 8, 4), np.uint8)
+    red[...] = (255, 0, 0, 255)
+    # A wall next to the eye, from far in front of it to as far behind it.
+    wall = Parallelogram(red, np.array([-2.0, 0.3, 0.5]), np.array([4.0, 0.0, 0.0]), np.array([0.0, 0.0, -1.0]))
+    size = {"width_px": 64, "height_px": 36}
+    image = draw((wall,), image_from_stack(np.array([0.6, 0.0, 0.0]), **size, fov_deg=90.0), **size)
+    assert (image[18, 50:, 0] > 200).all() and (image[18, :32] == 0).all()

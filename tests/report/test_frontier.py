@@ -12,15 +12,18 @@ import numpy as np
 import pytest
 
 from runtime.errors import FatalError, InputError
+from runtime.evaluation.displayed import displayed
 from runtime.model.predictor import Predictor
+from runtime.model.still import solve_still
 from runtime.optics.carried import expected_psnrs_db, intensities
 from runtime.optics.light import ONE_RAY
 from runtime.optics.quality import quality
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
-from runtime.report.frontier import Method, MethodResult, MethodRun, apart, measure, pair_result, run_method
+from runtime.report.frontier import SHIPPED, Method, MethodResult, MethodRun, apart, measure, pair_result, run_method
 from runtime.report.pairs import PairPainter, StillPair, eyes_at
 from tests.model.test_session import saved, shipped
+from tests.model_export.stills import random_still
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 192, 108)
 
@@ -121,3 +124,18 @@ def test_a_measurement_that_dies_ends_no_other_also_of_several_at_once(pair: Sti
     assert isinstance(one, MethodResult) and isinstance(last, MethodResult)
     assert [each.pair for each in last.pairs] == ["demo", "again"]
     assert last.pairs[0].quality == one.pairs[0].quality
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", SHIPPED)
+def test_no_random_pair_is_far_worse_than_the_iterative_reference(model: str) -> None:
+    """A pair that SART-30 shows with 32 dB has at least 28 with a model."""
+    for number in range(40):
+        pair = random_still(0, number, width_px=480, height_px=270)
+        seen: Any = {"eyes_m": pair.eyes_m, "fov_deg": pair.fov_deg}
+        shown = []
+        for method in (Method(model, "network", model), Method("SART-30", "iterative", "sart", 30)):
+            predictor = method.opened(pair.stack, threads=1)
+            layers = solve_still(*pair.images, predictor=predictor, **seen).layers
+            shown.append(displayed(layers, pair.images, pair.stack, similarity=False, **seen).quality)
+        assert shown[0].psnr_db >= 28 or shown[1].psnr_db < 32, (number, shown)
