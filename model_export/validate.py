@@ -21,12 +21,11 @@ from runtime.errors import InputError, one_line
 from runtime.kernels import FULL
 from runtime.model.contract import VERSION, Contract, parse_contract
 from runtime.model.network import PictureProposal
-from runtime.model.session import ModelSession
+from runtime.model.session import FILE_BYTES_MAX, ModelSession
 from runtime.optics.stack import PanelStack
 from runtime.support import untrusted_input
 from runtime.support.progress import tracked
 
-FILE_BYTES_MAX = 4 << 30  # maximum size of a model file
 LIMIT = 0.25 / 255  # maximum difference between panel values: a quarter of an 8-bit level
 SMALL = (96, 160)  # height and width of the test pictures for a model without a fixed size
 

@@ -251,12 +251,9 @@ class Tracker:
             self._other = None
             self._follow(again)
             return ""
-        if head is not None and head.surprise <= CHI2_DOUBT:
-            self._follow(head, is_return=is_held)
-            return ""
         if head is not None:
             is_others = again is not None and again.surprise < head.surprise and not (known and known.may_be_viewer)
-            if not is_others:
+            if head.surprise <= CHI2_DOUBT or not is_others:
                 self._follow(head, is_return=is_held)
                 return ""
         if known is not None and again is not None:
