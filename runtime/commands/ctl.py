@@ -54,7 +54,7 @@ def place(
     rotate: Annotated[Triple | None, number(-360, 360, "degrees", help="rotation in degrees about these axes")] = None,
     turntable: Annotated[float | None, number(-600, 600, help="turns per minute about the vertical axis")] = None,
     convergence: Annotated[float | None, number(-0.1, 0.1, "m", help="metres from the left to the right view")] = None,
-    comfort: Annotated[float | None, number(0, 10, "degrees", help="limit for the depth of live stereo")] = None,
+    comfort: Annotated[float | None, number(0, 10, "degrees", help="limit for the depth of stereo pictures")] = None,
     reset: Annotated[bool, typer.Option("--reset", help="restore the configured placement")] = False,
     config: Config = None,
 ) -> None:

@@ -36,7 +36,7 @@ class View:
     height_px: int
     reduction: int = 1  # display pixels per raster pixel, in each direction; outlines keep their width on the display
     display_from_view: F64 | None = None  # 3x3 rotation of a moved scene; the lamp is fixed to the display
-    comfort_deg: float = 0.0  # limit for the depth of live stereo pictures; 0 for none
+    comfort_deg: float = 0.0  # limit for the depth of stereo pictures; 0 for none
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 
-from runtime.records import U8
+from runtime.content.base import View
+from runtime.records import F64, U8
+
+if TYPE_CHECKING:
+    from runtime.content.pictures import ShownViews
 
 WIDTH_PX = 192  # width at which disparities are measured
 REACH_PX = 24  # largest disparity that is found, an eighth of the width
@@ -15,6 +19,8 @@ USUAL = (2.0, 98.0)  # percentiles that count as the farthest and the nearest co
 FEWEST = 0.02  # share of pixels that need a disparity
 SMALLEST = 0.25  # smallest size of the picture, as a fraction
 BLOCK_PX = 5
+MEASURED_EVERY = 3  # pictures after which the depth of a moving picture is measured again
+FOLLOWS = 0.2  # weight of a new measurement of a moving picture's depth
 DETAIL = 40.0  # Sobel gradient along a row at which a pixel's disparity counts
 
 
@@ -61,3 +67,48 @@ def adjusted(far_m: float, near_m: float, most_m: float) -> tuple[float, float]:
         scale = max(2 * most_m / (near_m - far_m), SMALLEST)
         return scale * (near_m + far_m) / 2, scale
     return max(near_m - most_m, 0.0) + min(far_m + most_m, 0.0), 1.0
+
+
+class DepthLimit:
+    """Keeps a sequence of stereo pictures within a comfortable depth."""
+
+    def __init__(self, *, follows: bool) -> None:
+        """Create a limit that `follows` the depth of a film's pictures slowly, or measures each picture by itself."""
+        self._follows = follows
+        self._depths: tuple[float, float] | None = None  # farthest and nearest disparity, as fractions of the width
+        self._measured: int | None = None  # number of the picture whose depth was measured last
+
+    def picture_from_view(self, shown: ShownViews, number: int, view: View) -> F64 | None:
+        """Return the homography from a view's pixels to those of a picture moved to where it is comfortable."""
+        plane_from_view, screen = shown.from_view(view), shown.screen
+        if not view.comfort_deg or len(shown.views) != 2:
+            self._depths = self._measured = None
+            return plane_from_view
+        self._measure(shown.views, number)
+        if plane_from_view is None or self._depths is None:
+            return plane_from_view
+        width_m = screen.width_px * screen.pitch_u_m
+        most_m = np.radians(view.comfort_deg) * max(view.eye_m[0], 0.0)
+        far, near = self._depths
+        shift_m, scale = adjusted(far * width_m, near * width_m, most_m)
+        middle = screen.width_px / 2, screen.height_px / 2
+        moved_px = (view.side - 0.5) * shift_m / screen.pitch_u_m
+        picture_from_plane = np.array(
+            [
+                [1 / scale, 0, middle[0] - (middle[0] + moved_px) / scale],
+                [0, 1 / scale, middle[1] * (1 - 1 / scale)],
+                [0, 0, 1],
+            ]
+        )
+        return np.asarray(picture_from_plane @ plane_from_view)
+
+    def _measure(self, views: list[U8], number: int) -> None:
+        last, every = self._measured, MEASURED_EVERY if self._follows else 1
+        if last is not None and last <= number < last + every:
+            return
+        found, self._measured = disparities(*views), number
+        if self._follows and self._depths is not None:
+            found = found or self._depths
+            far, near = ((1 - FOLLOWS) * old + FOLLOWS * new for old, new in zip(self._depths, found))
+            found = far, near
+        self._depths = found

@@ -20,13 +20,13 @@ import cv2
 import numpy as np
 
 from runtime.config import ContentSettings
-from runtime.content import comfort
 from runtime.content.base import ContentInfo, ContentSource, View
+from runtime.content.comfort import DepthLimit
 from runtime.content.layout import MONO, Layout, hint, layout_of, of_film
 from runtime.content.pictures import ShownViews
 from runtime.content.placing import SceneFile
 from runtime.errors import ContentFailure
-from runtime.records import F64, U8
+from runtime.records import U8
 from runtime.support.background import begin
 
 POINTER = np.array([[0, 0], [0, 0.9], [0.22, 0.7], [0.36, 1], [0.5, 0.94], [0.36, 0.64], [0.64, 0.64]])  # an arrow
@@ -35,8 +35,6 @@ POINTER_SIZE = 0.03  # height of the mouse pointer, as a fraction of the picture
 FROZEN_S = 2.0  # a feed counts as frozen after this time without a picture
 CLOSES_WITHIN_S = 2.0
 ENDS_WITHIN_S = 1.0  # time limit for a feed's process to end by itself
-MEASURED_EVERY = 3  # pictures after which the depth of a live picture is measured again
-FOLLOWS = 0.2  # weight of a new measurement of the depth
 LOOKED_AT_EVERY = 30  # pictures after which a flat feed is checked again for two views
 
 
@@ -98,8 +96,7 @@ class LiveSource(ContentSource):
         self.info = ContentInfo(feed.name, moving=True, background=file.background, fixed_views=True)
         self._at = 0
         self._shown: ShownViews
-        self._depths: tuple[float, float] | None = None  # farthest and nearest disparity, as fractions of the width
-        self._measured = 0  # number of the picture whose depth was measured last
+        self._limit = DepthLimit(follows=True)
         self._layout: tuple[tuple[int, ...], int, Layout] = ((), 0, MONO)  # a picture's shape, number and layout
         feed.start()
 
@@ -113,27 +110,8 @@ class LiveSource(ContentSource):
 
     def render(self, view: View, *, time_ns: int) -> U8:
         self.expect([view], time_ns=time_ns)
-        return self._shown.warped(min(view.side, len(self._shown.views) - 1), self._picture_from_view(view), view)
-
-    def _picture_from_view(self, view: View) -> F64 | None:
-        """Return the homography from a view's pixels to those of the picture, which stands where it is comfortable."""
-        plane_from_view, screen = self._shown.from_view(view), self._shown.screen
-        if plane_from_view is None or not view.comfort_deg or self._depths is None or len(self._shown.views) < 2:
-            return plane_from_view
-        width_m = screen.width_px * screen.pitch_u_m
-        most_m = np.radians(view.comfort_deg) * max(view.eye_m[0], 0.0)
-        far, near = self._depths
-        shift_m, scale = comfort.adjusted(far * width_m, near * width_m, most_m)
-        middle = screen.width_px / 2, screen.height_px / 2
-        moved_px = (view.side - 0.5) * shift_m / screen.pitch_u_m
-        picture_from_plane = np.array(
-            [
-                [1 / scale, 0, middle[0] - (middle[0] + moved_px) / scale],
-                [0, 1 / scale, middle[1] * (1 - 1 / scale)],
-                [0, 0, 1],
-            ]
-        )
-        return np.asarray(picture_from_plane @ plane_from_view)
+        picture_from_view = self._limit.picture_from_view(self._shown, self._at, view)
+        return self._shown.warped(min(view.side, len(self._shown.views) - 1), picture_from_view, view)
 
     def expect(self, views: Any, *, time_ns: int) -> None:
         """Take the newest picture, unless the next view is the same pair's second one."""
@@ -151,20 +129,6 @@ class LiveSource(ContentSource):
         if newest.pointer is not None:
             parts = with_pointer(parts, layout, newest.pointer)
         self._shown, self._at = ShownViews(parts, layout, self._file), newest.number
-        self._measure(is_limited=views[0].comfort_deg > 0)
-
-    def _measure(self, *, is_limited: bool) -> None:
-        """Follow the depth of the views, if it is limited."""
-        if not is_limited or len(self._shown.views) != 2:
-            self._depths = None
-            return
-        if self._depths is not None and self._at < self._measured + MEASURED_EVERY:
-            return
-        found, self._measured = comfort.disparities(*self._shown.views), self._at
-        if found is not None and self._depths is not None:
-            far, near = ((1 - FOLLOWS) * old + FOLLOWS * new for old, new in zip(self._depths, found))
-            found = far, near
-        self._depths = found or self._depths
 
     def _layout_for(self, picture: LivePicture) -> Layout:
         """Return the layout that the settings state, or the one that a picture of a new size seems to have."""

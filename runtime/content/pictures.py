@@ -8,13 +8,16 @@ from functools import partial
 import numpy as np
 
 from runtime.content.base import ContentInfo, ContentSource, View
-from runtime.content.frames import Frames, open_frames
+from runtime.content.comfort import DepthLimit
+from runtime.content.frames import Frames, PictureFiles, open_frames
 from runtime.content.images import WarpedPicture, plane_from_pixels, rgba_from_rgb
 from runtime.content.layout import Layout
 from runtime.content.placing import SceneFile
 from runtime.errors import ContentFailure, InputError
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F64, U8
+
+SLIDES_HZ = 2.0  # a folder of pictures that change more slowly is no film
 
 
 def screen(stack: PanelStack, *, width_px: int, height_px: int, pixel_aspect: float = 1.0) -> PlaneRaster:
@@ -70,6 +73,8 @@ class PicturesSource(ContentSource):
     def __init__(self, frames: Frames, *, file: SceneFile, context: object = None) -> None:
         """Create the source. Raises InputError if the first picture is too small for its layout."""
         self._frames, self._file = frames, file
+        is_slow = isinstance(frames, PictureFiles) and frames.rate_hz < SLIDES_HZ
+        self._limit = DepthLimit(follows=not is_slow)
         first = frames.frame(0)
         try:
             self._take(0, first)
@@ -92,7 +97,8 @@ class PicturesSource(ContentSource):
                 self._take(number, self._frames.frame(number))
             except ValueError as error:
                 raise ContentFailure(f"{self.info.name}: {error}") from None
-        return self._shown.warped(self._view_for(view), self._shown.from_view(view), view)
+        picture_from_view = self._limit.picture_from_view(self._shown, number, view)
+        return self._shown.warped(self._view_for(view), picture_from_view, view)
 
     def _take(self, number: int, picture: U8) -> None:
         """Split a picture into views, and show these now. Raises ValueError if it is too small for its layout."""

@@ -29,7 +29,7 @@ class Placing:
     rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)  # about the fixed axes x, y and z, in this order
     turntable_per_min: float = 0.0  # revolutions about the vertical axis
     convergence_m: float = 0.0  # how far the right view is moved to the right of the left one
-    comfort_deg: float = 0.0  # limit for the depth of live stereo pictures; 0 for none
+    comfort_deg: float = 0.0  # limit for the depth of stereo pictures; 0 for none
 
     def rotation(self, time_ns: int) -> F64:
         """Return the 3x3 rotation from the scene's frame to `stack` at a given time."""

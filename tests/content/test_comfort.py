@@ -1,4 +1,4 @@
-"""Tests that a live stereo picture is kept within a comfortable depth."""
+"""Tests that a stereo picture is kept within a comfortable depth."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from runtime.config import ContentSettings, StackGeometry
+from runtime.content.base import ContentSource
 from runtime.content.comfort import adjusted, disparities
 from runtime.content.registry import open_content
 from runtime.plan.drawing import raster_views
@@ -56,24 +57,37 @@ def test_views_are_moved_as_little_as_possible(far_mm: float, near_mm: float, sh
     assert adjusted(far_mm * 1e-3, near_mm * 1e-3, 0.01) == pytest.approx((shift_mm * 1e-3, scale))
 
 
-@pytest.mark.parametrize("comfort_deg", [0.0, 0.5])
+def expected(comfort_deg: float) -> tuple[float, float]:
+    """Disparities of `pair(30, 10)` as shown. The panels' 480 pixels are 0.5184 m wide, the eyes 0.6 m away."""
+    most = np.radians(comfort_deg) * 0.6 / 0.5184
+    return (-most, most) if comfort_deg else (10 / 480, 30 / 480)
+
+
+def shown_disparities(source: ContentSource, comfort_deg: float) -> list[float]:
+    """The same in the middle of the picture, whose edges have a disparity as well where it was moved."""
+    views = [replace(view, comfort_deg=comfort_deg) for view in raster_views(EYES, STACK.panel(1))]
+    source.expect(views, time_ns=0)
+    left, right = (source.render(view, time_ns=0)[60:210, 90:390, :3].copy() for view in views)
+    return [300 / 480 * one for one in disparities(left, right) or ()]
+
+
+def test_a_still_picture_is_shown_within_a_limit_set_later(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a_sbs.png"), np.hstack(pair(30, 10))[..., ::-1])
+    source = open_content(ContentSettings(scene=str(tmp_path / "a_sbs.png")), STACK, None)
+    for comfort_deg in (0.0, 0.8, 0.9, 0.0):
+        assert shown_disparities(source, comfort_deg) == pytest.approx(expected(comfort_deg), abs=0.006)
+    source.close()
+
+
+@pytest.mark.parametrize("comfort_deg", [0.0, 0.8])
 def test_a_pipe_is_shown_within_the_limit(tmp_path: Path, comfort_deg: float) -> None:
     os.mkfifo(tmp_path / "video")
     options = {"path": str(tmp_path / "video"), "rgb_size": [960, 270]}
-    source = open_content(
-        ContentSettings(scene="pipe", layout="side-by-side", options=options, comfort_deg=comfort_deg), STACK, None
-    )
+    source = open_content(ContentSettings(scene="pipe", layout="side-by-side", options=options), STACK, None)
     with (tmp_path / "video").open("wb") as writer:
-        writer.write(np.hstack(pair(40, 20)).tobytes())
+        writer.write(np.hstack(pair(30, 10)).tobytes())
         writer.flush()
         assert eventually(lambda: source.revision(time_ns=0) == 1)
-        views = raster_views(EYES, STACK.panel(1))
-        source.expect(views, time_ns=0)
-        shown = [source.render(view, time_ns=0)[..., :3].copy() for view in views]
-        found = disparities(*shown)
-        assert found is not None
-        # The panels' 480 pixels are 0.5184 m wide, and 0.5 degrees are 5.2 mm in 0.6 m.
-        most = np.radians(0.5) * 0.6 / 0.5184
-        expected = (20 / 480, 40 / 480) if not comfort_deg else (most - 20 / 480, most)
-        assert found == pytest.approx(expected, abs=0.006)
+        for limit in (comfort_deg, 0.8 - comfort_deg):  # the second one while the picture does not change
+            assert shown_disparities(source, limit) == pytest.approx(expected(limit), abs=0.006)
         source.close()
