@@ -288,8 +288,8 @@ class ContentSettings(Section):
     )
     comfort_deg: Annotated[float, within(0.0, 10.0, "degrees")] = Field(
         0.0,
-        description="largest angle by which the depth of a stereo picture, film, `window` or `pipe` may differ from the "
-        "display's; its views are moved, and made smaller if necessary (0 for no limit)",
+        description="largest angle by which the depth of a stereo picture, film, `window` or `pipe` may differ from "
+        "the display's; its views are moved, and made smaller if necessary (0 for no limit)",
     )
     turntable_per_min: Annotated[float, within(-600.0, 600.0, "turns per minute")] = Field(
         0.0,
