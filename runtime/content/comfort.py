@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
 
 from runtime.content.base import View
+from runtime.optics.stack import PlaneRaster
 from runtime.records import F64, U8
-
-if TYPE_CHECKING:
-    from runtime.content.pictures import ShownViews
 
 WIDTH_PX = 192  # width at which disparities are measured
 REACH_PX = 24  # largest disparity that is found, an eighth of the width
@@ -78,15 +76,18 @@ class DepthLimit:
         self._depths: tuple[float, float] | None = None  # farthest and nearest disparity, as fractions of the width
         self._measured: int | None = None  # number of the picture whose depth was measured last
 
-    def picture_from_view(self, shown: ShownViews, number: int, view: View) -> F64 | None:
-        """Return the homography from a view's pixels to those of a picture moved to where it is comfortable."""
-        plane_from_view, screen = shown.from_view(view), shown.screen
-        if not view.comfort_deg or len(shown.views) != 2:
+    def moved(
+        self, from_view: F64 | None, view: View, *, number: int, pictures: list[U8], screen: PlaneRaster
+    ) -> F64 | None:
+        """Return the homography `from_view` from a view's pixels to those of a picture, moved to where the
+        picture of this `number` is comfortable.
+        """
+        if not view.comfort_deg or len(pictures) != 2:
             self._depths = self._measured = None
-            return plane_from_view
-        self._measure(shown.views, number)
-        if plane_from_view is None or self._depths is None:
-            return plane_from_view
+            return from_view
+        self._measure(pictures, number)
+        if from_view is None or self._depths is None:
+            return from_view
         width_m = screen.width_px * screen.pitch_u_m
         most_m = np.radians(view.comfort_deg) * max(view.eye_m[0], 0.0)
         far, near = self._depths
@@ -100,7 +101,7 @@ class DepthLimit:
                 [0, 0, 1],
             ]
         )
-        return np.asarray(picture_from_plane @ plane_from_view)
+        return np.asarray(picture_from_plane @ from_view)
 
     def _measure(self, views: list[U8], number: int) -> None:
         last, every = self._measured, MEASURED_EVERY if self._follows else 1

@@ -110,7 +110,7 @@ class LiveSource(ContentSource):
 
     def render(self, view: View, *, time_ns: int) -> U8:
         self.expect([view], time_ns=time_ns)
-        picture_from_view = self._limit.picture_from_view(self._shown, self._at, view)
+        picture_from_view = self._shown.within(self._limit, self._at, view)
         return self._shown.warped(min(view.side, len(self._shown.views) - 1), picture_from_view, view)
 
     def expect(self, views: Any, *, time_ns: int) -> None:

@@ -50,6 +50,10 @@ class ShownViews:
         """
         return plane_from_pixels(view.pixels_from_stack, self.screen)
 
+    def within(self, limit: DepthLimit, number: int, view: View) -> F64 | None:
+        """Return the homography of `from_view` for the picture of this number, within a limit of depth."""
+        return limit.moved(self.from_view(view), view, number=number, pictures=self.views, screen=self.screen)
+
     def warped(self, number: int, picture_from_view: F64 | None, view: View) -> U8:
         """Return a view warped to an eye's raster, as `WarpedPicture` does."""
         if number not in self._warped:
@@ -97,8 +101,7 @@ class PicturesSource(ContentSource):
                 self._take(number, self._frames.frame(number))
             except ValueError as error:
                 raise ContentFailure(f"{self.info.name}: {error}") from None
-        picture_from_view = self._limit.picture_from_view(self._shown, number, view)
-        return self._shown.warped(self._view_for(view), picture_from_view, view)
+        return self._shown.warped(self._view_for(view), self._shown.within(self._limit, number, view), view)
 
     def _take(self, number: int, picture: U8) -> None:
         """Split a picture into views, and show these now. Raises ValueError if it is too small for its layout."""
