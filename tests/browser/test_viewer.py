@@ -33,7 +33,7 @@ from runtime.sensor.recording import recording_to
 from runtime.sensor.recording_format import RecordingHeader
 from runtime.support.artifacts import to_json
 from tests.browser.tracer import Panels, light
-from tests.panels.presentation_table import HEAD, ROWS, UNMOUNTED, Row, agrees
+from tests.panels.presentation_table import HEAD, ROWS, UNMOUNTED, Row, agrees, hills, picture
 from tests.test_cli import phasestack as phasestack_command
 
 HERE = Path(__file__).parent
@@ -109,20 +109,6 @@ def test_the_page_aligns_as_the_runtime_does_to_its_limits(stack: PanelStack, pe
 def test_eyes_that_stay_where_they_were_displace_nothing() -> None:
     eyes = eyes_at(distance_m=0.6).tolist()
     assert in_node("alignment(...given).parallax", [stack_table(STACK), eyes, eyes]) is None
-
-
-def smooth(*shape: int, seed: int) -> np.ndarray:
-    """(n, h, w, 4) codes that change over some pixels."""
-    coarse = np.random.default_rng(seed).integers(0, 256, (shape[0], shape[1] // 6, shape[2] // 6, 4), np.uint8)
-    layers = np.stack([cv2.resize(one, shape[:0:-1], interpolation=cv2.INTER_CUBIC) for one in coarse])
-    layers[..., 3] = 255
-    return layers
-
-
-def hills(rows: int, columns: int) -> np.ndarray:
-    """A relief with an outline: content before, on and behind the middle panel."""
-    v, u = np.mgrid[0:rows, 0:columns] / max(rows, columns)
-    return np.where(np.hypot(u - 0.5, v - 0.3) < 0.2, 0.2 + 0.1 * u, -0.15 * np.sin(9 * v)).astype(np.float32)
 
 
 def records(row: Row) -> dict[str, Any]:
@@ -272,7 +258,7 @@ def test_the_viewer_shows_the_light_that_a_tracer_finds(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_viewer_of_a_run_moves_its_content_by_its_depth(tmp_path: Path) -> None:
-    stack, relief, layers = replace(STACK, width_px=320, height_px=180), hills(90, 160), smooth(3, 180, 320, seed=4)
+    stack, relief, layers = replace(STACK, width_px=320, height_px=180), hills(90, 160), picture(3, 180, 320, seed=4)
     eyes = eyes_at(distance_m=0.7, angle_deg=6, height_m=0.1)
     page = viewer_html(layers, (), stack, eyes_m=eyes, fov_deg=40, text=["in relief"], relief=relief)
     (tmp_path / "viewer.html").write_text(page)
@@ -289,7 +275,7 @@ def test_the_viewer_of_a_run_moves_its_content_by_its_depth(tmp_path: Path) -> N
 def test_tilted_panels_too(tmp_path: Path) -> None:
     tilt = Tilt(tuple((0.0, *slopes) for slopes in TILT), (0.5, 0.0, 0.0))
     stack = replace(STACK, width_px=320, height_px=180, tilt=tilt)
-    layers = smooth(3, 180, 320, seed=4)[..., :3]
+    layers = picture(3, 180, 320, seed=4)[..., :3]
     eyes = eyes_at(distance_m=0.7, angle_deg=6, height_m=0.1)
     page = viewer_html(layers, (), stack, eyes_m=eyes, fov_deg=40, text=["tilted"])
     (tmp_path / "viewer.html").write_text(page)

@@ -488,100 +488,82 @@ def test_a_reload_draws_the_new_scene_in_its_field_of_view(content: ContentSourc
     assert kept.lights[2]["true"] is not None
 
 
-def test_a_live_figure_applies_to_these_eyes_and_this_state_alone(content: ContentSource, solved: Solution) -> None:
-    observer, _ = looking(content, simulated=False, newest=True)
-    numbers = count(1)
+class Live:
+    """An observer of a live page, whose refreshes are numbered."""
 
-    def light(shown: Refresh) -> float | None:
-        observer.refreshed(shown)
-        return observer.light(shown)["light_db"]
+    def __init__(self, content: ContentSource) -> None:
+        self.observer, _ = looking(content, simulated=False, newest=True)
+        self._numbers = count(1)
 
-    def measured(eyes_m: Any, state: int, solution: Solution) -> bool:
-        return eventually(
-            lambda: light(replace(refresh(next(numbers), solution, eyes_m=eyes_m), state_version=state)) is not None
-        )
+    def shown(self, solution: Solution, *, state_version: int = 0, later: int = 0, **changes: Any) -> Refresh:
+        """The next refresh, or one that comes `later`."""
+        return replace(refresh(next(self._numbers) + later, solution, **changes), state_version=state_version)
 
-    assert measured(EYES, 0, solved)
-    moved = replace(refresh(next(numbers), solved, eyes_m=aside(0.02)), state_version=0)
-    assert light(moved) is None, "the figure of another position"
-    assert measured(aside(0.02), 0, solved)
-    stale = replace(refresh(next(numbers), solved, eyes_m=aside(0.02)), state_version=1)
-    assert light(stale) is None, "the scene or the model has changed, and the panels still show the old solution"
-    assert observer.light(stale)["light_age_s"] is None
-    assert measured(aside(0.02), 1, replace(solved, number=2, state_version=1))
-    assert light(moved) is None
+    def light(self, solution: Solution, **changes: Any) -> dict[str, Any]:
+        """The light that is reported at the next refresh."""
+        shown = self.shown(solution, **changes)
+        self.observer.refreshed(shown)
+        return self.observer.light(shown)
 
+    def db(self, solution: Solution, **changes: Any) -> float | None:
+        return self.light(solution, **changes)["light_db"]
 
-def test_a_live_figure_applies_until_either_of_two_people_moves(content: ContentSource, solved: Solution) -> None:
-    observer, _ = looking(content, simulated=False, newest=True)
-    numbers = count(1)
-
-    def light(*places: Any) -> float | None:
-        people = tuple(PersonAccount(number, eyes_m, eyes_m) for number, eyes_m in enumerate(places, start=1))
-        shown = refresh(next(numbers), solved, people=people)
-        observer.refreshed(shown)
-        return observer.light(shown)["light_db"]
-
-    assert eventually(lambda: light(EYES, aside(0.2)) is not None)
-    assert light(EYES, aside(0.22)) is None
-    assert light(EYES) is None
-
-
-def test_a_live_figure_falls_where_depth_is_seen_from_elsewhere(content: ContentSource, solved: Solution) -> None:
-    observer, _ = looking(content, simulated=False, newest=True)
-    numbers = count(1)
-
-    def light_db(eyes_m: Any) -> float:
-        found: list[float] = []
-
-        def is_measured() -> bool:
-            shown = refresh(next(numbers), solved, eyes_m=eyes_m)
-            observer.refreshed(shown)
-            found.append(observer.light(shown)["light_db"])
-            return found[-1] is not None
-
-        assert eventually(is_measured)
+    def measured(self, solution: Solution, **changes: Any) -> float:
+        """The light at a later refresh, once it is measured."""
+        found: list[float | None] = []
+        assert eventually(lambda: found.append(self.db(solution, **changes)) or found[-1] is not None)
+        assert found[-1] is not None
         return found[-1]
 
-    assert light_db(EYES) - light_db(aside(0.15)) > 5
+
+@pytest.fixture
+def live(content: ContentSource) -> Live:
+    return Live(content)
 
 
-def test_a_live_figure_has_an_age_and_follows_a_better_solution(content: ContentSource, solved: Solution) -> None:
-    observer, _ = looking(content, simulated=False, newest=True)
-    numbers = count(1)
+def test_a_live_figure_applies_to_these_eyes_and_this_state_alone(live: Live, solved: Solution) -> None:
+    there: dict[str, Any] = {"eyes_m": aside(0.02)}
+    live.measured(solved)
+    assert live.db(solved, **there) is None, "the figure of another position"
+    live.measured(solved, **there)
+    stale = live.light(solved, **there, state_version=1)
+    assert stale["light_db"] is None, "the scene or the model has changed, and the panels still show the old solution"
+    assert stale["light_age_s"] is None
+    live.measured(replace(solved, number=2, state_version=1), **there, state_version=1)
+    assert live.db(solved, **there) is None
 
-    def frame_measured(solution: Solution) -> int | None:
-        shown = refresh(next(numbers), solution)
-        observer.refreshed(shown)
-        return observer.light(shown)["measured_frame"]
 
-    assert eventually(lambda: frame_measured(solved) is not None)
-    first = frame_measured(solved)
-    later = refresh(next(numbers) + 100, solved)
-    assert first is not None
+def test_a_live_figure_applies_until_either_of_two_people_moves(live: Live, solved: Solution) -> None:
+    def people(*places: Any) -> dict[str, Any]:
+        return {"people": tuple(PersonAccount(number, eyes_m, eyes_m) for number, eyes_m in enumerate(places, start=1))}
+
+    live.measured(solved, **people(EYES, aside(0.2)))
+    assert live.db(solved, **people(EYES, aside(0.22))) is None
+    assert live.db(solved, **people(EYES)) is None
+
+
+def test_a_live_figure_falls_where_depth_is_seen_from_elsewhere(live: Live, solved: Solution) -> None:
+    assert live.measured(solved) - live.measured(solved, eyes_m=aside(0.15)) > 5
+
+
+def test_a_live_figure_has_an_age_and_follows_a_better_solution(live: Live, solved: Solution) -> None:
+    live.measured(solved)
+    first = live.light(solved)["measured_frame"]
+    later = live.shown(solved, later=100)
     age_s = (later.account.frame - first) * PERIOD_NS / NS_PER_S
-    assert observer.light(later)["light_age_s"] == pytest.approx(age_s, abs=0.06)
-    better = replace(solved, number=2)
-    assert eventually(lambda: frame_measured(better) != first)
+    assert live.observer.light(later)["light_age_s"] == pytest.approx(age_s, abs=0.06)
+    assert eventually(lambda: live.light(replace(solved, number=2))["measured_frame"] != first)
 
 
 @pytest.mark.parametrize(("settled_s", "has_figure"), [(0.0, False), (600.0, True)])
 def test_a_refined_solution_that_stays_on_the_panels_has_no_old_figure(
-    content: ContentSource, solved: Solution, monkeypatch: pytest.MonkeyPatch, settled_s: float, has_figure: bool
+    live: Live, solved: Solution, monkeypatch: pytest.MonkeyPatch, settled_s: float, has_figure: bool
 ) -> None:
     monkeypatch.setattr(sampling, "SETTLED_S", settled_s)
-    observer, _ = looking(content, simulated=False, newest=True)
-    numbers = count(1)
-
-    def is_measured(solution: Solution) -> bool:
-        shown = refresh(next(numbers), solution)
-        observer.refreshed(shown)
-        return observer.light(shown)["light_db"] is not None
-
-    assert eventually(lambda: is_measured(solved))
+    live.measured(solved)
     refined = replace(solved, number=2)
-    assert is_measured(refined) == has_figure
-    assert eventually(lambda: is_measured(refined))
+    assert (live.db(refined) is not None) == has_figure
+    live.measured(refined)
 
 
 # --- kept light --------------------------------------------------------------------------------------------------

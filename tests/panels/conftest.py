@@ -30,11 +30,6 @@ def gl(shared_context: moderngl.Context) -> Iterator[moderngl.Context]:
         yield shared_context
 
 
-@pytest.fixture
-def context(gl: moderngl.Context) -> moderngl.Context:
-    return gl
-
-
 @pytest.fixture(scope="module")
 def screen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[xserver.XServer]:
     server = xserver.start_or_skip(tmp_path_factory.mktemp("xorg"))
