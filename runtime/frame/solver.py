@@ -58,7 +58,7 @@ class Solver:
         self.measured = Measured()  # times and errors measured for each item of the plan
         self.plan: Plan | None = None
         self._planned_for: tuple[int, tuple[bool, ...]] | None = None
-        self._seeing: tuple[bool, ...] = (True, True)
+        self.seeing: tuple[bool, ...] = (True, True)  # for each eye, True if it can see the display
         self._policy = FramePolicy()
         self._solved: SolutionKey | None = None
         self._flat: SolutionKey | None = None
@@ -82,7 +82,7 @@ class Solver:
         Raises ContextLost, after which this solver can no longer be used.
         """
         state = self.state
-        self._replan(state, request.eyes_m)
+        self._replan(request.eyes_m)
         time_ns = request.time_ns
         try:
             revision = state.content.revision(time_ns=time_ns)
@@ -97,7 +97,7 @@ class Solver:
             flat=self._flat,
         )
         if job.kind == "flat":
-            return self._draw_flat(state, revision=revision, time_ns=time_ns)
+            return self._draw_flat(revision=revision, time_ns=time_ns)
         if job.eyes_m is not None:
             wanted = request.refined_to if job.kind == "refine" else request.effort
             offered, steps = state.predictor.reductions, state.predictor.steps  # may be those of a new model
@@ -105,7 +105,7 @@ class Solver:
                 wanted = Effort(1, steps)
             elif job.kind == "solve":
                 wanted = replace(wanted, steps=min(wanted.steps, steps))
-            return self._solve(state, request, job.eyes_m, wanted, revision=revision)
+            return self._solve(request, job.eyes_m, wanted, revision=revision)
         if request.eyes_m is not None and not request.paused:
             self._missing = {}  # the latest solution already fulfils the request
         return SolverUpdate(missing=dict(self._missing))
@@ -124,10 +124,8 @@ class Solver:
         state.predictor.solve(replace(job, steps=1), watch)
         return watch.stage_ms
 
-    def _solve(
-        self, state: SceneState, request: SolveRequest, eyes_m: Eyes, effort: Effort, *, revision: int
-    ) -> SolverUpdate:
-        settings, watch = state.settings.model, Stopwatch()
+    def _solve(self, request: SolveRequest, eyes_m: Eyes, effort: Effort, *, revision: int) -> SolverUpdate:
+        state, settings, watch = self.state, self.state.settings.model, Stopwatch()
         sigma_m = request.sigma_m if settings.eye_sigma_mm == "auto" else settings.eye_sigma_mm / 1e3
         limited = self._timed and settings.budget_ms > 0
         deadline_ns = perf_counter_ns() + round(settings.budget_ms * NS_PER_MS) if limited else None
@@ -137,7 +135,7 @@ class Solver:
                 assert self._kept is not None
                 job = self._kept
             else:
-                job = self._drawn(state, request, eyes_m, effort.reduction)
+                job = self._drawn(request, eyes_m, effort.reduction)
             if effort.focus:
                 focused = focused_job(state.content, job, time_ns=request.time_ns, focus=state.settings.content.focus)
                 if focused is None:  # the present solution stays, and is not asked for again
@@ -181,26 +179,21 @@ class Solver:
         )
         return SolverUpdate(solution=solution)
 
-    def _drawn(self, state: SceneState, request: SolveRequest, eyes_m: Eyes, reduction: int) -> Job:
+    def _drawn(self, request: SolveRequest, eyes_m: Eyes, reduction: int) -> Job:
         """Draw a solution's target pictures, and copy them for a refinement if the head is at rest."""
+        state, plan = self.state, self.state.settings.plan
         job = drawn_job(
-            state.predictor,
-            state.content,
-            eyes_m,
-            time_ns=request.time_ns,
-            reduction=reduction,
-            trimmed=state.settings.plan.enabled,
-            before=self._windows.get(reduction),
-            in_depth=state.settings.plan.align,
-        )
+            state.predictor, state.content, eyes_m, time_ns=request.time_ns, reduction=reduction,
+            trimmed=plan.enabled, before=self._windows.get(reduction), in_depth=plan.align,
+        )  # fmt: skip
         self._kept = None
         if request.eyes_label == "rested" and not any(isinstance(v.picture, DrawnPicture) for v in job.views):
             views = tuple(TargetView(view.pixels.copy(), view.plane_from_picture) for view in job.views)
             job = self._kept = replace(job, targets=replace(job.targets, views=views))
         return job
 
-    def _draw_flat(self, state: SceneState, *, revision: int, time_ns: int) -> SolverUpdate:
-        watch = Stopwatch()
+    def _draw_flat(self, *, revision: int, time_ns: int) -> SolverUpdate:
+        state, watch = self.state, Stopwatch()
         failed = False
         try:
             raster = self.stack.panel(self.stack.count // 2)
@@ -220,15 +213,10 @@ class Solver:
         flat = Solution(next(self._numbers), layers, None, time_ns, stage_ms=watch.stage_ms)
         return SolverUpdate(flat=flat, missing=dict(self._missing))  # the model's fault is not over
 
-    @property
-    def seeing(self) -> tuple[bool, ...]:
-        """For the left and the right eye, True if the eye can see the display."""
-        return self._seeing
-
-    def _replan(self, state: SceneState, eyes_m: Eyes | None) -> None:
-        """Update the plan if the run's state or the set of eyes that can see the display has changed."""
-        seeing = self._seeing if eyes_m is None else seeing_eyes(eyes_m, self._seeing)
-        self._seeing = seeing
+    def _replan(self, eyes_m: Eyes | None) -> None:
+        """Update the plan if the state or the set of eyes that can see the display has changed."""
+        state, seeing = self.state, self.seeing if eyes_m is None else seeing_eyes(eyes_m, self.seeing)
+        self.seeing = seeing
         made_for = (state.version, seeing)
         if made_for != self._planned_for:
             self._planned_for = made_for
