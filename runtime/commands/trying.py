@@ -26,7 +26,7 @@ from runtime.daemon.supervise import run_daemon
 from runtime.page.connections import LOOPBACK, listening, server_of
 from runtime.page.server import application
 
-SIZE_PX = {"width_px": 960, "height_px": 540}  # small by default, because small panels get more solutions per second
+SIZE_PX = {"width_px": 960, "height_px": 540}  # without [stack], because small panels get more solutions per second
 SCENE = "room"  # scene shown without a configuration file
 WEBCAM_FOV_DEG = 65.0  # typical of webcams; can be changed in a configuration file
 SLOW_PAGE_S = 2.0  # the page's camera counts as lost if no picture arrives for this long
@@ -36,7 +36,9 @@ def settings_of(
     config: Path | None, *, scene: str | None, layout: str | None, model: str | None, webcam: bool
 ) -> Settings:
     """Return the settings for `phasestack try`. Raises InputError if a setting or option is invalid."""
-    settings = load_settings(config) if config else changed(Settings(), "stack", SIZE_PX, source="try")
+    settings = load_settings(config)
+    if "stack" not in settings.model_fields_set:
+        settings = changed(settings, "stack", SIZE_PX, source="try")
     settings = with_options(settings, scene=scene or (None if config else SCENE), layout=layout, model=model)
     if settings.sensor.driver != "usb-camera" or not webcam:
         sensor: dict[str, Any] = (

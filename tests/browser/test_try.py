@@ -19,6 +19,7 @@ from websockets.sync.client import connect
 
 from runtime.browser.link import BrowserLink, PageMode
 from runtime.clock import MonotonicClock
+from runtime.commands.trying import settings_of
 from runtime.config import StackGeometry
 from runtime.content.scenes import SCENES
 from runtime.sensor.browser import BrowserEyes
@@ -210,6 +211,15 @@ def test_a_resting_head_is_sampled_on_and_captures_only_go_forward() -> None:
                 samples += sensor.read_arrived(1.0)
     captures = [sample.capture_ns for sample in samples]
     assert captures == sorted(set(captures)) and all(sample.eyes is not None for sample in samples)
+
+
+@pytest.mark.parametrize(
+    ("text", "width_px"), [("[content]\nfov_deg = 41.0", 960), ("[stack]\nx_m = [-0.03, 0.0, 0.03]", 1920)]
+)
+def test_panels_are_small_unless_the_configuration_has_a_stack(tmp_path: Path, text: str, width_px: int) -> None:
+    (tmp_path / "c.toml").write_text(text)
+    settings = settings_of(tmp_path / "c.toml", scene=None, layout=None, model=None, webcam=False)
+    assert settings.stack.width_px == width_px and settings.content.scene == "demo"
 
 
 def test_it_ends_when_its_time_is_up(tmp_path: Path) -> None:
