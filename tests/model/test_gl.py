@@ -221,12 +221,8 @@ def test_a_panel_wider_than_the_driver_allows_is_refused(gl: GlBackend) -> None:
 
 def test_only_pictures_the_networks_answer_and_layers_cross(gl: GlBackend, monkeypatch: pytest.MonkeyPatch) -> None:
     """Down: the layers, where arrays are asked for. Up: pictures and the network's answer, besides small tables."""
-    kinds, crossed, write, read = (
-        {"f1": "codes", "nu2": "numbers", "i2": "numbers"},
-        [],
-        Texture.write,
-        Framebuffer.read_into,
-    )
+    kinds, crossed = {"f1": "codes", "nu2": "numbers", "i2": "numbers"}, list[str]()
+    write, read = Texture.write, Framebuffer.read_into
 
     def written(self: Any, *given: Any, **more: Any) -> None:
         crossed.append(f"{kinds.get(self.dtype, 'tables')} up")
@@ -240,9 +236,8 @@ def test_only_pictures_the_networks_answer_and_layers_cross(gl: GlBackend, monke
     monkeypatch.setattr(Texture, "write", written)
     monkeypatch.setattr(Framebuffer, "read_into", read_into)
     layers_of(opengl, cards(eyes(0.6), STACK), eyes(0.6))
-    assert [what for what in crossed if what != "tables up"] == ["codes up"] * 2 + ["numbers up"] * 2 + [
-        "codes down"
-    ] * 3
+    wanted = ["codes up"] * 2 + ["numbers up"] * 2 + ["codes down"] * 3
+    assert [what for what in crossed if what != "tables up"] == wanted
 
 
 def test_automatic_takes_the_faster_one_and_says_what_was_measured(gl: GlBackend) -> None:
