@@ -25,27 +25,21 @@ from runtime.eyes.calibration import demo_stack_from_sensor
 from runtime.records import EyePoints, SensorFrame
 from runtime.sensor.recording import recording_to
 from runtime.sensor.recording_format import RecordingHeader
+from tests.calib.camera import measured
 from tests.calls import answered
 from tests.waiting import eventually
 
 STEP_NS = NS_PER_S // 30
 
 
-def eyes_at(stack_m: np.ndarray, *, noise_m: float = 0.0, random: np.random.Generator | None = None) -> EyePoints:
+def eyes_at(stack_m: np.ndarray) -> EyePoints:
     """Two eyes about a midpoint in `stack`, as the demo's camera measures them."""
-    both = stack_m + np.array([[0.0, -0.03, 0.0], [0.0, 0.03, 0.0]])
-    sensor_from_stack = np.linalg.inv(demo_stack_from_sensor())
-    sensor = both @ sensor_from_stack[:3, :3].T + sensor_from_stack[:3, 3]
-    return EyePoints(sensor + (random.normal(scale=noise_m, size=(2, 3)) if random else 0.0), np.array([0.9, 0.9]))
-
-
-def walk(path: Path, said: list[str]) -> Walk:
-    return Walk(PairsFile(path), grid()[:3], say=said.append)
+    return EyePoints(measured(stack_m + np.array([[0.0, -0.03, 0.0], [0.0, 0.03, 0.0]])), np.array([0.9, 0.9]))
 
 
 def test_restless_eyes_are_not_taken(tmp_path: Path) -> None:
     said: list[str] = []
-    person = walk(tmp_path / "pairs.csv", said)
+    person = Walk(PairsFile(tmp_path / "pairs.csv"), grid()[:3], say=said.append)
     for number in range(15):
         person.see(number * STEP_NS, eyes_at(np.array([0.5, 0.01 * number, 0.1])), "")
     person.press(Key.ACCEPT)
@@ -55,7 +49,7 @@ def test_restless_eyes_are_not_taken(tmp_path: Path) -> None:
 
 def test_slow_panels_lose_no_sample(tmp_path: Path) -> None:
     hardware = SetupHardware(lambda: None)
-    source = str(recording(tmp_path / "r.mcap", [np.array([0.5, 0.0, 0.1])] * 9, true=False))
+    source = str(recording(tmp_path / "r.mcap", [np.array([0.5, 0.0, 0.1])] * 9))
     hardware.open_sensor(with_options(Settings(), replay=source))
     try:
         worker = hardware._worker
@@ -66,31 +60,24 @@ def test_slow_panels_lose_no_sample(tmp_path: Path) -> None:
         hardware.close()
 
 
-def recording(path: Path, places: list[np.ndarray], *, true: bool) -> Path:
-    """A second at each place."""
+def recording(path: Path, places: list[np.ndarray]) -> Path:
+    """A second at each place, without true eye positions."""
     with recording_to(path, RecordingHeader(driver="openni2", serial="A1")) as writer:
         for number in range(30 * len(places)):
-            place = places[number // 30]
-            truth = place + np.array([[0.0, -0.03, 0.0], [0.0, 0.03, 0.0]]) if true else None
-            writer.write(SensorFrame(number + 1, number * STEP_NS, eyes=eyes_at(place), true_eyes_m=truth))
+            writer.write(SensorFrame(number + 1, number * STEP_NS, eyes=eyes_at(places[number // 30])))
     return path
 
 
-def capture(*options: str) -> dict:
-    told: dict = answered(app, "capture", *options)
-    return told
-
-
 def test_a_recording_that_does_not_know_its_truth_is_refused(tmp_path: Path) -> None:
-    path = recording(tmp_path / "r.mcap", [grid()[0].midpoint_m], true=False)
+    path = recording(tmp_path / "r.mcap", [grid()[0].midpoint_m])
     with pytest.raises(InputError, match="contains no true eye positions"):
-        capture("--replay", str(path), "--out", str(tmp_path / "p.csv"))
+        answered(app, "capture", "--replay", path, "--out", tmp_path / "p.csv")
     assert not (tmp_path / "p.csv").exists()
 
 
 def test_the_demo_recording_calibrates_itself(tmp_path: Path) -> None:
     """End to end: a recording's truth reproduces its geometry to the millimetre."""
-    told = capture("--replay", "demo", "--out", str(tmp_path / "p.csv"))
+    told = answered(app, "capture", "--replay", "demo", "--out", tmp_path / "p.csv")
     assert told["pairs"] >= 8
     solved = answered(app, "solve", "--pairs", tmp_path / "p.csv", "--out", tmp_path / "c.toml")
     matrix = np.array(solved["stack_from_sensor"])
@@ -101,7 +88,7 @@ def test_the_demo_recording_calibrates_itself(tmp_path: Path) -> None:
 def test_a_person_at_the_terminal_takes_pairs_from_a_sensor(tmp_path: Path) -> None:
     """Run the command in a separate process, with Enter pressed until enough samples have arrived."""
     viewpoint = grid()[0]
-    source = recording(tmp_path / "r.mcap", [viewpoint.midpoint_m] * 30, true=False)
+    source = recording(tmp_path / "r.mcap", [viewpoint.midpoint_m] * 30)
     (tmp_path / "config.toml").write_text(f'[sensor]\ndriver = "replay"\nsource = "{source}"\n')
     out = tmp_path / "p.csv"
     command = [sys.executable, "-m", "runtime.cli", "calibrate", "capture", "--out", str(out), "--json",

@@ -40,15 +40,18 @@ def pictures() -> list[np.ndarray]:
     return photographs(phase_of)
 
 
+def measured_from(folder: Path, pictures: list[np.ndarray]) -> np.ndarray:
+    """The curve (256, 3) that the command measures from photographs."""
+    for number, picture in enumerate(pictures):
+        cv2.imwrite(str(folder / f"{number}.png"), picture)
+    answered(app, "grey", "--photos", folder, "--panel", PANEL, "--out", folder / "lut.csv")
+    return measured_curve(folder / "lut.csv").astype(float)
+
+
 def test_two_photographs_tell_a_panels_curve_without_knowing_the_cameras(
     tmp_path: Path, pictures: list[np.ndarray]
 ) -> None:
-    folder = tmp_path / "photos"
-    folder.mkdir()
-    for number, picture in enumerate(pictures):
-        cv2.imwrite(str(folder / f"{number}.png"), picture)
-    answered(app, "grey", "--photos", folder, "--panel", PANEL, "--out", tmp_path / "lut.csv")
-    lut = measured_curve(tmp_path / "lut.csv")[:, 1].astype(float)
+    lut = measured_from(tmp_path, pictures)[:, 1]
     wanted = np.linspace(0, 1, 256)
     shown = np.sin(np.pi / 2 * phase_of(lut)) ** 2
     assert np.abs(shown - np.sin(np.pi / 2 * wanted) ** 2).max() < 0.03
@@ -59,12 +62,8 @@ def test_colour_photographs_tell_each_channels_curve(tmp_path: Path, pictures: l
         return grey**0.7
 
     other = photographs(blue_phase_of)
-    folder = tmp_path / "photos"
-    folder.mkdir()
-    for number, (green, outer) in enumerate(zip(pictures, other, strict=True)):
-        cv2.imwrite(str(folder / f"{number}.png"), np.dstack([outer, green, green]))  # blue, green, red
-    answered(app, "grey", "--photos", folder, "--panel", PANEL, "--out", tmp_path / "lut.csv")
-    lut, wanted = measured_curve(tmp_path / "lut.csv").astype(float), np.sin(np.pi / 2 * np.linspace(0, 1, 256)) ** 2
+    blue_green_red = [np.dstack([blue, green, green]) for green, blue in zip(pictures, other, strict=True)]
+    lut, wanted = measured_from(tmp_path, blue_green_red), np.sin(np.pi / 2 * np.linspace(0, 1, 256)) ** 2
     for channel, curve in enumerate((phase_of, phase_of, blue_phase_of)):
         assert np.abs(np.sin(np.pi / 2 * curve(lut[:, channel])) ** 2 - wanted).max() < 0.03
 

@@ -27,9 +27,8 @@ EYE = viewing_place_m(Settings().calibration)
 CONFIG = '# kept\n[[output.panels]]\nconnector = "A"\n[[output.panels]]\nconnector = "B"\n[[output.panels]]\n'
 
 
-def panels(*options: str) -> dict:
-    told: dict = answered(app, "panels", *options)
-    return told
+def request(photos: Path, out: Path, config: Path) -> tuple[object, ...]:
+    return ("panels", "--photos", photos, "--out", out, "--config", config, "--write")
 
 
 @pytest.fixture(scope="module")
@@ -49,14 +48,6 @@ def photos(tmp_path: Path, pictures: list[np.ndarray]) -> Path:
     for number, picture in enumerate(pictures):
         cv2.imwrite(str(folder / f"{number + 1}.bmp"), picture)  # quickly
     return folder
-
-
-def replaced(photos: Path, number: int, picture: np.ndarray) -> None:
-    cv2.imwrite(str(photos / f"{number}.bmp"), picture)
-
-
-def blurred(picture: np.ndarray) -> np.ndarray:
-    return cv2.GaussianBlur(picture, (0, 0), 4.0)
 
 
 def half_covered(picture: np.ndarray) -> np.ndarray:
@@ -87,9 +78,7 @@ def test_photographs_register_the_panels_in_the_configuration(
 ) -> None:
     config = tmp_path / "c.toml"
     config.write_text(CONFIG)
-    told = panels(
-        "--photos", str(photos), "--out", str(tmp_path / "r"), "--config", str(config), "--write",
-    )  # fmt: skip
+    told = answered(app, *request(photos, tmp_path / "r", config))
     settings = load_settings(config)
     assert config.read_text().startswith("# kept")
     assert [panel.connector for panel in settings.output.panels] == ["A", "B", ""]
@@ -108,7 +97,7 @@ def test_photographs_register_the_panels_in_the_configuration(
 @pytest.mark.parametrize(
     ("spoil", "why"),
     [
-        (blurred, "blurred"),
+        (lambda picture: cv2.GaussianBlur(picture, (0, 0), 4.0), "blurred"),
         (half_covered, "keep the whole panel in view"),
         (lambda picture: picture[:, ::-1], "is mirrored"),
         (lambda picture: np.full_like(picture, 30), "shows no marks"),
@@ -120,8 +109,8 @@ def test_photographs_that_cannot_be_used_are_named_and_nothing_is_written(
     config = tmp_path / "c.toml"
     config.write_text(CONFIG)
     for number in (1, 3, 5):
-        replaced(photos, number, np.ascontiguousarray(spoil(pictures[number - 1])))
-    text = refusal(panels, "--photos", str(photos), "--out", str(tmp_path / "r"), "--config", str(config), "--write")
+        cv2.imwrite(str(photos / f"{number}.bmp"), np.ascontiguousarray(spoil(pictures[number - 1])))
+    text = refusal(answered, app, *request(photos, tmp_path / "r", config))
     assert "4 of 7 photographs are usable" in text
     for number in (1, 3, 5):
         assert f"{number}.bmp" in text
@@ -134,8 +123,7 @@ def test_photographs_that_cannot_be_used_are_named_and_nothing_is_written(
 def test_a_configuration_that_cannot_be_updated_leaves_no_registration(tmp_path: Path, photos: Path) -> None:
     config = tmp_path / f"{'c' * 250}.toml"  # has no room for the number of a kept version
     config.write_text(CONFIG)
-    with pytest.raises(InputError, match="cannot be written"):
-        panels("--photos", str(photos), "--out", str(tmp_path / "r"), "--config", str(config), "--write")
+    assert "cannot be written" in refusal(answered, app, *request(photos, tmp_path / "r", config))
     assert config.read_text() == CONFIG
     assert not (tmp_path / "r").exists()
 

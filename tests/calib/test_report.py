@@ -15,11 +15,6 @@ from tests.calls import answered
 from tests.eyes.test_calibration_file import PUBLISHED
 
 
-def report(*options: str) -> dict:
-    told: dict = answered(app, "report", *options)
-    return told
-
-
 @pytest.fixture
 def calibration(tmp_path: Path) -> Path:
     sensor = measured(sigma_m=0.003)
@@ -31,7 +26,7 @@ def calibration(tmp_path: Path) -> Path:
 
 def test_the_page_holds_numbers_and_pictures_and_needs_nothing_else(tmp_path: Path, calibration: Path) -> None:
     out = tmp_path / "deep" / "report"
-    told = report(str(calibration), "--out", str(out))
+    told = answered(app, "report", calibration, "--out", out)
     assert told["points"] == 27
     assert told["rejected"] == 1
     page = (out / "index.html").read_text()
@@ -45,7 +40,7 @@ def test_the_page_holds_numbers_and_pictures_and_needs_nothing_else(tmp_path: Pa
 def test_the_published_prototype_is_reported_without_its_points(tmp_path: Path) -> None:
     path = tmp_path / "published.toml"
     path.write_text(PUBLISHED)
-    told = report(str(path), "--out", str(tmp_path / "r"))
+    told = answered(app, "report", path, "--out", tmp_path / "r")
     assert told["scale"] == pytest.approx(8.125, abs=1e-3)
     assert told["similarity_defect"] < 2e-6
     assert told["eye_error_mm"] is None
@@ -67,5 +62,5 @@ def test_spoiled_points_are_refused_and_nothing_is_written(tmp_path: Path, data:
     path = tmp_path / "c.toml"
     path.write_text(PUBLISHED + "[data]\n" + data + "\n")
     with pytest.raises(InputError, match=told):
-        report(str(path), "--out", str(tmp_path / "r"))
+        answered(app, "report", path, "--out", tmp_path / "r")
     assert not (tmp_path / "r").exists()
