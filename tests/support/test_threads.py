@@ -47,9 +47,11 @@ threading.Thread(target=work).start()
 def test_the_presenter_comes_before_all_others_and_what_it_starts_does_not() -> None:
     """Policies and niceness of a thread within the block, of a thread started there, and after it."""
     found: list[tuple[int, int]] = []
+    switching_s: list[float] = []
 
     def note() -> None:
         found.append((os.sched_getscheduler(0), os.getpriority(os.PRIO_PROCESS, threading.get_native_id())))
+        switching_s.append(sys.getswitchinterval())
 
     def presenter() -> None:
         note()
@@ -64,7 +66,7 @@ def test_the_presenter_comes_before_all_others_and_what_it_starts_does_not() -> 
     thread.start()
     thread.join()
     outside, within, started, after = found
-    assert after == outside
-    assert started[0] == os.SCHED_OTHER
+    assert after == outside and switching_s[-1] == switching_s[0]
+    assert started[0] == os.SCHED_OTHER and switching_s[1] < switching_s[0]
     if os.getuid() == 0:
         assert within[0] & ~os.SCHED_RESET_ON_FORK == os.SCHED_RR or within[1] < outside[1]
