@@ -177,7 +177,7 @@ class WindowFeed(Feed):
         """Wait for a click, and return the number of the window there. Raises ValueError if there is none."""
         self.problem = "click on the window to show"
         was_down = True
-        with closing(XPointer(display)) as pointer:
+        with closing(XConnection(display)) as pointer:
             while not self._ends.wait(CLICK_S):
                 now = pointer.now()
                 if now is None:
@@ -200,7 +200,7 @@ class WindowFeed(Feed):
                 source = f"{display}+{place.x},{place.y}"
         looked_s, last, last_pointer = time.monotonic(), np.empty((0, 0, 3), np.uint8), None
         with ExitStack() as stack:
-            mouse = stack.enter_context(closing(XPointer(display)))
+            mouse = stack.enter_context(closing(XConnection(display)))
             if place is not None and place.window:
                 mouse.keep_covered(place.window)
             container = stack.enter_context(av.open(source, format="x11grab", options=given))
@@ -282,7 +282,7 @@ class Pointed(Structure):
     )  # fmt: skip
 
 
-class XPointer:
+class XConnection:
     """Connection to an X server that reads its pointer, and keeps covered windows."""
 
     def __init__(self, display: str) -> None:

@@ -18,7 +18,7 @@ log = logging.getLogger("phasestack.background")
 
 PRESENTER_NICENESS = -10  # used if realtime priority is not allowed
 REALTIME_PRIORITY = 1  # lowest realtime priority, which still takes precedence over every ordinary thread
-SWITCH_S = 0.0005
+SWITCH_S = 0.0005  # after which a thread that waits for Python's lock asks for it
 BACKGROUND_NICENESS = 10
 MEASURING_NICENESS = 15  # for measurements and file output, which are not urgent
 # Time limit for waits after a stop request. The rest of the two seconds is left for calls without a timeout.

@@ -1,35 +1,30 @@
 """Process untrusted files in a child process with limits on memory and time.
 
 Parsers hold Python's global lock, and even a small file can make a parser use all memory. The child returns arrays in
-shared memory. Progress, log lines and errors are forwarded as if the work ran in this process. The functions from
-`started` on also serve `process`.
+shared memory. Progress, log lines and errors are forwarded as if the work ran in this process.
 """
 
 from __future__ import annotations
 
-import ctypes
 import errno
-import logging
 import os
 import resource
-import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack, closing, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
 
-from runtime.errors import PASSING, InputError, PhasestackError, TransientError, one_line
+from runtime.errors import InputError, PhasestackError, TransientError, one_line
 from runtime.support import progress
 from runtime.support.channel import Channel, ChannelClosed
-from runtime.support.crash import written
 from runtime.support.extras import missing_extra
+from runtime.support.interpreter import end_with_parent, log_forwarded, passing_cause, started, take_over
 from runtime.support.untrusted_input import LIMITS, MIB
 
-PR_SET_PDEATHSIG = 1  # constant from Linux's prctl.h
 MEMORY_MAX = 4 << 30  # default memory limit in bytes, enough for a scene that reaches every limit
 LOOK_S = 0.05  # interval between checks for cancellation
 SENT_S = 600.0  # how long a result waits for the parent to read
@@ -129,66 +124,6 @@ def main(channel: Channel) -> None:
             return
         problem = one_line(f"cannot be read: {type(error).__name__}: {error}")
         channel.send(("refused", InputError(source, "", problem), None), timeout_s=SENT_S)
-
-
-def started(
-    module: str, argument: str, *, files: Sequence[int], output: int, **variables: str
-) -> subprocess.Popen[bytes]:
-    """Start a module of this copy of phasestack, with inherited file descriptors. Raises OSError."""
-    path = os.pathsep.join([str(Path(__file__).parents[2]), *filter(None, sys.path)])
-    return subprocess.Popen(
-        [sys.executable, "-P", "-m", module, argument],
-        stdin=subprocess.DEVNULL,
-        stdout=output,
-        stderr=output,
-        pass_fds=files,
-        env=os.environ | {"PYTHONPATH": path} | variables,
-    )
-
-
-def end_with_parent() -> None:
-    """Have the kernel end this process when the thread that started it ends."""
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-
-
-def take_over(limits: Mapping[str, Any], send: Callable[[dict[str, Any]], object]) -> None:
-    """Use the parent's limits for untrusted files, and pass log records to `send` (`log_forwarded`)."""
-    for name, limit in limits.items():
-        setattr(LIMITS, name, limit)
-    logging.getLogger().addHandler(_Forwarded(send))
-    logging.getLogger().setLevel(logging.INFO)
-
-
-class _Forwarded(logging.Handler):
-    def __init__(self, send: Callable[[dict[str, Any]], object]) -> None:
-        super().__init__()
-        self._send = send
-
-    def emit(self, record: logging.LogRecord) -> None:
-        text = record.getMessage()
-        if record.exc_info and record.exc_info[1]:
-            text += f": {written(record.exc_info[1])}"
-        content = {"name": record.name, "levelno": record.levelno, "levelname": record.levelname, "msg": text}
-        with suppress(ChannelClosed):
-            self._send(content | {"always": getattr(record, "always", False)})
-
-
-def log_forwarded(content: dict[str, Any]) -> None:
-    """Log a record that another process has passed on."""
-    logger = logging.getLogger(content["name"])
-    if logger.isEnabledFor(content["levelno"]):
-        logger.handle(logging.makeLogRecord(content))
-
-
-def passing_cause(error: BaseException | None) -> OSError | MemoryError | None:
-    """Return the shortage that has caused an error, without its trace, or None if it has another cause."""
-    while error is not None:
-        if isinstance(error, MemoryError):
-            return MemoryError()
-        if isinstance(error, OSError) and error.errno in PASSING:
-            return OSError(error.errno, error.strerror)
-        error = error.__cause__ or error.__context__
-    return None
 
 
 if __name__ == "__main__":

@@ -30,8 +30,8 @@ from runtime.clock import NS_PER_S
 from runtime.errors import FatalError, PhasestackError, TransientError, one_line
 from runtime.support.background import begin, patience_s
 from runtime.support.channel import Channel, ChannelClosed, shared_memory
-from runtime.support.child import end_with_parent, log_forwarded, passing_cause, started, take_over
 from runtime.support.crash import report_of, written
+from runtime.support.interpreter import end_with_parent, log_forwarded, passing_cause, started, take_over
 from runtime.support.untrusted_input import LIMITS, MIB
 
 log = logging.getLogger("phasestack.processes")
