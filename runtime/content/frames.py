@@ -37,6 +37,10 @@ PICTURES = (
 NOT_READ = (*RAW, ".jxl", ".exr", ".hdr", ".psd", ".svg", ".jp2", *VIDEOS)  # skipped and logged if found in a folder
 TOLD = 3  # number of skipped files per folder that are named in the log
 TELL_EVERY = 64  # number of pictures between progress reports
+AROUND = (
+    "shows all directions (equirectangular), which is not supported; crop it, for example with "
+    "`ffmpeg -i in -vf v360=e:flat:h_fov=75:v_fov=46 out`"
+)
 SKIPPED = 60  # most frames that are decoded in passing instead of seeking
 
 
@@ -78,11 +82,12 @@ class PictureFiles(Frames):
             try:
                 if folder is not None and path.suffix.lower() in VIDEOS:
                     raise InputError(path, "", "is a film; set content.scene to the film itself")
-                header = header_of_file(path)  # decoding every picture would take too long
+                # Only the header, because decoding every picture would take too long.
+                layout = layout_in(header_of_file(path), path, settings, folder)
             except InputError as error:
                 refused.append(error)
                 continue
-            self.layouts.append(layout_in(header, path, settings, folder))
+            self.layouts.append(layout)
             self._paths.append(path)
         self._held = -1, np.empty((0, 0, 3), np.uint8)
         while self._paths and self._held[0] < 0:
@@ -174,16 +179,17 @@ class Video(Frames):
 
 def layout_in(header: Header, path: Path, settings: ContentSettings, folder: Path | None = None) -> Layout:
     """Return a picture's layout, from the settings, the header, or the name of the file or of `folder`.
-    Two views in a file are side by side, unless the settings request a single view or the cross-eyed order.
+    Two views in a file are side by side, unless the settings request a single view or the cross-eyed order. Raises
+    InputError for a picture all around, or a layout that is not possible.
     """
-    layout = layout_of(path, settings, stated=header.layout)
     if header.is_around:
-        layout = replace(layout, span_deg=360)
+        raise InputError(path, "", AROUND)
+    layout = layout_of(path, settings, stated=header.layout)
     if len(header.views) == 1:
         return layout if layout != MONO or folder is None else layout_of(folder, settings)
     if settings.layout == "mono" or (layout.right_first and settings.layout != "auto"):
         return layout
-    return replace(PAIR, span_deg=layout.span_deg)
+    return PAIR
 
 
 def open_frames(path: Path, settings: ContentSettings) -> Frames:
@@ -207,19 +213,23 @@ def _suggest(path: Path, picture: U8) -> None:
 
 
 def _film_layout(film: Film, settings: ContentSettings, picture: U8) -> Layout:
-    """Return the layout of a film whose first picture is given. Logs views that are not shown."""
+    """Return the layout of a film whose first picture is given. Logs views that are not shown.
+    Raises InputError for a film all around.
+    """
     stated, path = film.header, film.path
+    if stated.is_around:
+        raise InputError(path, "", AROUND)
     if stated.left_out and settings.layout == "auto":
         log.warning("%s: showing the film without %s", path, stated.left_out)
     layout = layout_of(path, settings, stated=stated.layout)
     if is_pair := stated.views == 2 and settings.layout != "mono":
-        layout = replace(PAIR, span_deg=layout.span_deg, right_first=layout.right_first)
-    layout = replace(layout, span_deg=stated.span_deg or layout.span_deg, sample_aspect=stated.pixel_aspect)
+        layout = replace(PAIR, right_first=layout.right_first)
+    layout = replace(layout, sample_aspect=stated.pixel_aspect)
     if settings.layout == "auto" and not is_pair:
         layout = replace(layout, right_first=layout.right_first or stated.right_first)
         height, width = picture.shape[:2]
         layout = of_film(layout, path, width_px=round(width * stated.pixel_aspect), height_px=height)
-        if layout.kind == "mono" and not layout.span_deg and not stated.left_out:
+        if layout.kind == "mono" and not stated.left_out:
             _suggest(path, picture)
     return layout
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -39,9 +38,6 @@ ALIKE = 0.8  # a picture's halves may be two views if their correlation exceeds 
 SMALL_PX = (64, 48)  # halves are reduced to this size for comparison
 SHIFT_PX = 6  # largest shift between views, in pixels of the reduced halves
 ROUGH = 6.0  # least standard deviation in 8-bit values; smoother halves always correlate, so they are not compared
-AHEAD_DEG = 75.0  # the crop's horizontal field of view, slightly larger than a display's
-SHAPE = 16 / 9  # width over height of the crop
-ASPECT_OFF = 0.02  # relative tolerance for a view's aspect ratio
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,20 +49,10 @@ class Layout:
     rows: int = 1
     half: bool = False  # True if the views are squeezed to half their width or height
     right_first: bool = False  # True if the right eye's view comes first
-    span_deg: int = 0  # longitude covered by equirectangular views, or 0 for flat views
     view_aspect: float = 0.0  # width over height of a quilt's views, or 0 if their pixels are square
     sample_aspect: float = 1.0  # width over height of a film's pixels
 
     def views(self, picture: U8) -> list[U8]:
-        """Split a picture into its views, as `parts` does, and crop equirectangular ones to the middle."""
-        parts = self.parts(picture)
-        height, width = parts[0].shape[:2]
-        squeezed = (1.0, 0.5, 2.0) if len(parts) == 2 else (1.0,)  # names need not state that views are squeezed
-        if not self.span_deg or not any(is_around(width * by, height, self.span_deg) for by in squeezed):
-            return parts
-        return [ahead(part, self.span_deg) for part in parts]
-
-    def parts(self, picture: U8) -> list[U8]:
         """Split a picture into [left, right], a single view, or a quilt's views from the leftmost to the
         rightmost camera. Raises ValueError if the picture is smaller than one pixel per view.
         """
@@ -117,9 +103,7 @@ def layout_of(path: Path, settings: ContentSettings, *, stated: str = "") -> Lay
         return Layout("quilt", columns, rows, view_aspect=aspect)
     kind = named.removeprefix("half-").replace("cross-eyed", "side-by-side")
     columns, rows = {"side-by-side": (2, 1), "top-bottom": (1, 2)}.get(kind, (1, 1))
-    span_deg = _span_deg(path) if kind in ("mono", "side-by-side", "top-bottom") else 0
-    is_half = named.startswith("half-") and not span_deg
-    return Layout(kind, columns, rows, half=is_half, right_first=named.endswith("cross-eyed"), span_deg=span_deg)
+    return Layout(kind, columns, rows, half=named.startswith("half-"), right_first=named.endswith("cross-eyed"))
 
 
 def of_film(layout: Layout, path: Path, *, width_px: int, height_px: int) -> Layout:
@@ -128,7 +112,7 @@ def of_film(layout: Layout, path: Path, *, width_px: int, height_px: int) -> Lay
     """
     aspect = width_px / height_px
     squeezed = {"side-by-side": aspect < NARROW, "top-bottom": aspect > LOW}.get(layout.kind, False)
-    is_half = squeezed and not layout.span_deg and not FULL.search(path.stem.lower())
+    is_half = squeezed and not FULL.search(path.stem.lower())
     return replace(layout, half=layout.half or is_half)
 
 
@@ -145,14 +129,6 @@ def _named(path: Path) -> str:
             if re.search(rf"(^|.* )({mark}){rest}$", words):
                 return layout
     return "mono"
-
-
-def _span_deg(path: Path) -> int:
-    """Return the longitude stated by a file name: 360 or 180 degrees, or 0 if it states none."""
-    words = re.split(r"[^a-z0-9]+", path.stem.lower())
-    if {"180", "vr180", "180x180"} & set(words):
-        return 180
-    return 360 * bool({"360", "vr360", "360x180", "equirect", "equirectangular", "photosphere"} & set(words))
 
 
 def hint(picture: U8) -> str:
@@ -175,28 +151,3 @@ def _detail(view: U8) -> F32:
     """Reduce a view to a small grey picture for comparison, high-pass filtered because smooth areas look alike."""
     small = cv2.cvtColor(cv2.resize(view, SMALL_PX, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
     return np.asarray(small.astype(np.float32) - cv2.GaussianBlur(small, (0, 0), 8).astype(np.float32), np.float32)
-
-
-def is_around(width: float, height: float, span_deg: int) -> bool:
-    """Return True if a view with square pixels has the aspect ratio of `span_deg` by 180 degrees."""
-    return abs(width / height * 180 / span_deg - 1) < ASPECT_OFF
-
-
-def ahead(view: U8, span_deg: int) -> U8:
-    """Middle of an equirectangular view (h, w, 3), reprojected to a pinhole camera of similar resolution."""
-    u, v = _places(view.shape[1], view.shape[0], span_deg)
-    return np.asarray(cv2.remap(view, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
-
-
-@lru_cache(maxsize=2)
-def _places(width: int, height: int, span_deg: int) -> tuple[F32, F32]:
-    """Return the view's column and row that each pixel of the crop shows, integers at pixel centres as in OpenCV."""
-    columns = max(round(width * AHEAD_DEG / span_deg), 16)
-    rows, half = max(round(columns / SHAPE), 9), np.tan(np.radians(AHEAD_DEG / 2))
-    x = ((np.arange(columns) + 0.5) * 2 / columns - 1) * half
-    y = ((np.arange(rows) + 0.5) * 2 - rows) / columns * half
-    x, y = np.meshgrid(x, y)
-    around, down = np.arctan(x), np.arctan2(y, np.hypot(x, 1.0))
-    u = (around / np.radians(span_deg) + 0.5) * width - 0.5
-    v = (down / np.pi + 0.5) * height - 0.5
-    return u.astype(np.float32), v.astype(np.float32)

@@ -158,9 +158,9 @@ def end_group(process: subprocess.Popen[bytes]) -> None:
 def with_pointer(views: list[U8], layout: Layout, place: tuple[float, float]) -> list[U8]:
     """Return copies of a picture's views with a mouse pointer at the same place in all, which is the
     screen's depth. `place` is the pointer's in the whole picture, as fractions of its width and height. Views of
-    quilts and panoramas are returned unchanged.
+    a quilt are returned unchanged.
     """
-    if layout.kind == "quilt" or layout.span_deg:
+    if layout.kind == "quilt":
         return views
     height, width = views[0].shape[:2]
     at = np.array([place[0] * layout.columns % 1 * width, place[1] * layout.rows % 1 * height])

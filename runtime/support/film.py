@@ -34,7 +34,7 @@ STEREO = {1: "side-by-side", 2: "top-bottom"}  # FFmpeg's AVStereo3DType
 # FFmpeg's AVStereo3DType from 3 to 8
 UNSEEN = "alternating frames", "checkerboard", "quincunx", "alternating rows", "alternating columns", "MV-HEVC"
 BT709, UNSPECIFIED = 1, 2  # AVColorSpace
-HALF_EQUIRECTANGULAR = 3  # AVSphericalProjection
+RECTILINEAR = 4  # AVSphericalProjection
 
 # The camera may answer with a playlist (HLS), but not make FFmpeg open local files.
 STREAM_OPTIONS = {
@@ -61,7 +61,7 @@ class FilmHeader:
     """The arrangement that a film file declares. Fields it does not declare have their defaults."""
 
     layout: str = ""  # in the syntax of `content.layout`
-    span_deg: int = 0  # longitude covered by equirectangular views
+    is_around: bool = False  # True if the pictures show a half or a full sphere
     left_out: str = ""  # description of a view that is declared but not supported
     pixel_aspect: float = 1.0  # pixel width divided by pixel height
     views: int = 1  # 2 if the left and right view are separate streams
@@ -276,13 +276,12 @@ def _header(frame: av.VideoFrame, streams: list[Any]) -> FilmHeader:
     if stream.metadata.get("stereo_mode", "").startswith("anaglyph_cyan"):
         layout = "anaglyph"
     left_out = f"its second view ({UNSEEN[kind - 3]}); convert it to side by side" if 3 <= kind <= 8 else ""
-    span_deg = 0
-    if "SPHERICAL" in side:
-        projection, left, _, right = struct.unpack_from("<i12x3I", side["SPHERICAL"])
-        span_deg = 180 if projection == HALF_EQUIRECTANGULAR or left + right > (1 << 30) else 360
     aspect = float(stream.sample_aspect_ratio or 1) or 1.0
     aspect = aspect if frame.rotation % 180 == 0 else 1 / aspect
-    return FilmHeader(layout, span_deg, left_out, aspect, len(streams), right_first=bool(layout and flags & 1))
+    projection = struct.unpack_from("<i", side.get("SPHERICAL", RECTILINEAR.to_bytes(4, "little")))[0]
+    return FilmHeader(
+        layout, projection != RECTILINEAR, left_out, aspect, len(streams), right_first=bool(layout and flags & 1)
+    )
 
 
 def _progressive(frame: av.VideoFrame) -> Any:

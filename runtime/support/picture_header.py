@@ -27,6 +27,7 @@ SIDE_MAX_PX = 1 << 16  # maximum width and height that a header may declare
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF", "PPM", "TGA", "AVIF")
 ANIMATED = ("GIF", "PNG", "WEBP", "AVIF")
 ORIENTATION = 0x0112  # EXIF tag
+SPHERES, ASPECT_OFF = (1, 2, 4), 0.02  # width over height of a sphere or two, and its relative tolerance
 TURNED = (5, 6, 7, 8)  # EXIF orientations with a quarter turn, which swaps width and height
 MP_ENTRIES, MP_NUMBER = 0xB002, 0xB101  # MPO tags: list of pictures, and a picture's viewpoint (counted from the left)
 DISPARITY, UNDEFINED = "Multi-Frame Image: (Disparity)", "Undefined"
@@ -74,7 +75,7 @@ class Header:
     height_px: int
     views: tuple[int, ...]  # index of the frame to show, or indices of the left and right eye's frames
     is_animated: bool
-    is_around: bool = False  # True if the XMP data declare a full sphere (equirectangular projection)
+    is_around: bool = False  # True if XMP data and shape are those of a full sphere, also of a stereo pair
     warning: str = ""  # warning for the user, such as a missing second view; empty: none
     layout: str = ""  # arrangement of two views in one picture, from a JPEG's stereo header; empty: none
     other: slice | None = None  # byte range of the second view in a Leia picture
@@ -144,7 +145,8 @@ def _header_of(path: Path, file: IO[bytes]) -> Header:
                 width, height = height, width
             is_animated = image.format in ANIMATED and bool(getattr(image, "is_animated", False))
             views, warning = _views(image, is_named_so=path.suffix.lower() == ".mpo")
-            is_around, layout, other = b"equirectangular" in _xmp(image), _jps_layout(image), None
+            is_sphere = any(abs(width / height / aspect - 1) < ASPECT_OFF for aspect in SPHERES)
+            is_around, layout, other = is_sphere and b"equirectangular" in _xmp(image), _jps_layout(image), None
             if image.format == "JPEG" and (found := _leia_view(file, image.size)):
                 other, views = found[0], (1, 0) if found[1] else (0, 1)
             kind = image.format

@@ -148,10 +148,8 @@ def st3d(mode: int) -> bytes:
     return _box(b"st3d", bytes(4) + bytes([mode]))
 
 
-def equirectangular(*, cut: float = 0.0) -> bytes:
-    """cut: of the width, left and right each."""
-    bounds = struct.pack(">LLL", 0, 0, 0) + struct.pack(">LL", *[int(cut * (1 << 32))] * 2)
-    proj = _box(b"proj", _box(b"prhd", bytes(16)) + _box(b"equi", bounds))
+def equirectangular() -> bytes:
+    proj = _box(b"proj", _box(b"prhd", bytes(16)) + _box(b"equi", bytes(20)))
     return _box(b"sv3d", _box(b"svhd", bytes(4) + b"me\0") + proj)
 
 

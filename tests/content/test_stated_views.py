@@ -12,7 +12,7 @@ from PIL import Image
 
 from runtime.config import ContentSettings
 from runtime.content.frames import open_frames, read_pair
-from runtime.support.film import Film
+from runtime.errors import InputError
 from runtime.support.picture_file import read_image, read_views
 from tests.content.picture_files import equirectangular, film, lif, multiview, of_colours, spherical_xml, st3d
 from tests.content.test_pictures import solid
@@ -88,12 +88,10 @@ def test_stated_stereo_that_is_not_shown_is_logged(tmp_path: Path, caplog: Any) 
     assert "a.mp4: showing the film without its second view (MV-HEVC)" in caplog.text
 
 
-def test_a_sphere_of_360_or_180_degrees_is_recognised(tmp_path: Path) -> None:
-    for cut, span_deg in ((0.0, 360), (0.25, 180)):
-        path = film(tmp_path / "a.mp4", pair(), added=equirectangular(cut=cut))
-        assert Film(path).header.span_deg == span_deg
-    found = Film(film(tmp_path / "a.mp4", pair(), added=spherical_xml("top-bottom"), into=(b"moov", b"trak"))).header
-    assert (found.layout, found.span_deg) == ("top-bottom", 360)
+def test_a_film_all_around_is_refused(tmp_path: Path) -> None:
+    for added, into in ((equirectangular(), {}), (spherical_xml("top-bottom"), {"into": (b"moov", b"trak")})):
+        with pytest.raises(InputError, match=r"a\.mp4: shows all directions"):
+            open_frames(film(tmp_path / "a.mp4", pair(), added=added, **into), ContentSettings())
 
 
 # Colours
