@@ -1,7 +1,8 @@
 """Change one place of a room at a time, and count how many changes its tests notice (`make mutate ROOM=frame`).
 
 Python is changed in its syntax tree: comparisons, logic, arithmetic, numbers, and statements that are left out. C++ is
-changed by its operators, and the kernels are rebuilt. Everything happens in a copy of the tree.
+changed by its operators, and the kernels are rebuilt. Everything happens in a copy of the tree. A change meets the
+tests that run its line, the quickest file first; a change that no test runs has not been noticed.
 """
 
 from __future__ import annotations
@@ -9,18 +10,26 @@ from __future__ import annotations
 import argparse
 import ast
 import copy
+import json
 import os
 import random
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
+
+import cv2  # noqa: F401 - libraries that every fork would load
+import hypothesis  # noqa: F401
+import numpy as np  # noqa: F401
+import pytest
+from coverage import CoverageData
 
 ROOT = Path(__file__).parents[1]
 COPIED = ("runtime", "calib", "model_export", "phasestack", "tests", "examples", "docs", "systemd", "pyproject.toml")
@@ -29,7 +38,9 @@ TESTS_OF = {
     "plan": ("plan", "frame"),
     "browser": ("daemon", "browser"),
     "page": ("page", "browser"),
+    "calib/similarity": ("calib/test_similarity.py", "calib/test_methods.py"),
 }
+OUTPUT = "output.txt"
 LONGEST = 5.0  # tests that take this many times longer than without a change have noticed it
 SWAPPED: dict[type[ast.AST], type[ast.AST]] = {
     ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
@@ -109,31 +120,81 @@ def _changed(node: Any) -> Iterator[ast.AST]:
         yield ast.Pass()
 
 
+@dataclass(frozen=True, slots=True)
+class Coverage:
+    """Seconds that each test takes, and the tests that run each line, or any line inside a function, of a file."""
+
+    seconds: dict[str, float]
+    by_line: dict[Path, dict[int, set[str]]]
+
+    def tests_of(self, mutation: Mutation, source: bytes) -> set[str]:
+        """Return the tests that run a mutation. Empty: no test does, not even in a process that it starts."""
+        if mutation.path.suffix != ".py":
+            return set(self.seconds)
+        first, last = (source[:place].count(b"\n") + 1 for place in (mutation.start, mutation.end))
+        tests_by_line = self.by_line.get(mutation.path, {})
+        found = [tests_by_line[line] for line in range(first, last + 1) if line in tests_by_line]
+        if not found and _is_in_function(source, first):
+            return set()
+        tests = set().union(*found) - {""}
+        if not tests or not _is_in_function(source, first):  # on import, or in another process
+            tests = set().union(*tests_by_line.values()) - {""}
+        return tests & set(self.seconds) or set(self.seconds)
+
+
+def _is_in_function(source: bytes, line: int) -> bool:
+    functions = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.FunctionDef)]
+    return any(node.body[0].lineno <= line <= (node.end_lineno or 0) for node in functions)
+
+
+class Chosen:
+    """Plugin of pytest that runs certain tests, the quickest file first, and keeps the seconds of each."""
+
+    def __init__(self, seconds: dict[str, float] | None = None) -> None:
+        self.chosen = seconds
+        self.seconds: dict[str, float] = {}
+
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        if self.chosen is not None:
+            by_file: dict[Path, float] = {}
+            items[:] = [item for item in items if item.nodeid in self.chosen]
+            for item in items:
+                by_file[item.path] = by_file.get(item.path, 0.0) + self.chosen[item.nodeid]
+            items.sort(key=lambda item: (by_file[item.path], str(item.path), self.chosen[item.nodeid]))
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        self.seconds[report.nodeid] = self.seconds.get(report.nodeid, 0.0) + report.duration
+
+
 class Tree:
     """Copy of the project in which one file at a time is changed."""
 
     def __init__(self, folder: Path, room: str) -> None:
         self.folder, self.room = folder, room
         for name in COPIED:
-            (shutil.copytree if (ROOT / name).is_dir() else shutil.copy)(ROOT / name, folder / name)
+            (shutil.copytree if (ROOT / name).is_dir() else shutil.copy2)(ROOT / name, folder / name)
 
-    def tests_pass(self, timeout_s: float | None) -> bool:
-        """Return True if the tests of the room, or of its part, pass. Then they have not noticed the change."""
+    def coverage(self) -> Coverage:
+        """Run the tests of the room, or of its part, without a change, and return what each runs."""
         room, _, part = self.room.partition("/")
-        own = self.folder / "tests" / room / f"test_{part}.py"
-        folders = [str(own)] if own.exists() else [f"tests/{name}" for name in TESTS_OF.get(room, (room,))]
-        command = [sys.executable, "-m", "pytest", "-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", *folders]
-        environment = os.environ | {"PYTHONPATH": str(self.folder), "PYTHONDONTWRITEBYTECODE": "1"}
-        try:
-            done = subprocess.run(
-                command, cwd=self.folder, env=environment, capture_output=True, timeout=timeout_s, check=False
-            )
-        except subprocess.TimeoutExpired:
-            return False
-        return done.returncode == 0
+        own = (f"{room}/test_{part}.py",) if (self.folder / f"tests/{room}/test_{part}.py").exists() else (room,)
+        places = [f"tests/{name}" for name in TESTS_OF.get(self.room, TESTS_OF.get(room, own))]
+        seconds_file, told = self.folder / "seconds.json", ("--cov", "--cov-context=test", "--cov-report=")
+        if self._code_of_tests((*told, "--cov-fail-under=0", *places), Chosen(), None, seconds_file) != 0:
+            raise SystemExit(f"{(self.folder / OUTPUT).read_text()}the tests of {self.room} fail without any change")
+        data = CoverageData(str(self.folder / ".coverage"))
+        data.read()
+        by_line = {
+            Path(file).relative_to(self.folder): {
+                line: {context.rpartition("|")[0] for context in contexts}
+                for line, contexts in data.contexts_by_lineno(file).items()
+            }
+            for file in data.measured_files()
+        }
+        return Coverage(json.loads(seconds_file.read_text()), by_line)
 
-    def survives(self, mutation: Mutation, timeout_s: float) -> bool:
-        """Return True if the tests pass in spite of the mutation. A kernel that is not compiled has been noticed."""
+    def survives(self, mutation: Mutation, seconds: dict[str, float]) -> bool:
+        """Return True if tests pass in spite of a mutation. A kernel that is not compiled has been noticed."""
         path = self.folder / mutation.path
         source = path.read_bytes()
         path.write_bytes(mutation.applied(source))
@@ -142,9 +203,63 @@ class Tree:
                 built = subprocess.run([sys.executable, *BUILD], cwd=self.folder, capture_output=True, check=False)
                 if built.returncode:
                     return False
-            return self.tests_pass(timeout_s)
+            places = sorted({test.partition("::")[0] for test in seconds})
+            code = self._code_of_tests(places, Chosen(seconds), LONGEST * sum(seconds.values()) + 30) if places else 0
+            return code in (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED)
         finally:
             path.write_bytes(source)
+
+    def _code_of_tests(
+        self, told: Sequence[str], plugin: Chosen, timeout_s: float | None, seconds_file: Path | None = None
+    ) -> int | None:
+        """Run pytest in a fork, which has the libraries already, and return its exit code; none after the timeout."""
+        child = os.fork()
+        if not child:
+            _run_tests(self.folder, told, plugin, seconds_file)
+        end = time.monotonic() + (timeout_s or float("inf"))
+        while time.monotonic() < end:
+            done, status = os.waitpid(child, os.WNOHANG)
+            if done:
+                return os.waitstatus_to_exitcode(status)
+            time.sleep(0.02)
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        return None
+
+
+def _run_tests(folder: Path, told: Sequence[str], plugin: Chosen, seconds_file: Path | None) -> NoReturn:
+    """Run pytest in this process, and end it. Bytecode of a mutation is not kept: it would outlive the mutation."""
+    code = 1
+    try:
+        output = os.open(folder / OUTPUT, os.O_RDWR | os.O_CREAT | os.O_TRUNC)
+        for standard in (0, 1, 2):
+            os.dup2(output, standard)
+        os.chdir(folder)
+        sys.path[:] = [str(folder), *(place for place in sys.path if place not in ("", str(ROOT)))]
+        for name in [name for name in sys.modules if name.partition(".")[0] in COPIED]:
+            del sys.modules[name]
+        os.environ["PYTHONPATH"] = str(folder)
+        if seconds_file is None:
+            os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
+            sys.dont_write_bytecode = True
+        code = pytest.main(
+            [
+                "-x",
+                "-q",
+                "-m",
+                "not slow",
+                "-p",
+                "no:cacheprovider",
+                "-W",
+                "ignore::pytest.PytestAssertRewriteWarning",
+                *told,
+            ],
+            plugins=[plugin],
+        )
+        if seconds_file is not None:
+            seconds_file.write_text(json.dumps(plugin.seconds))
+    finally:
+        os._exit(code)
 
 
 def files_of(room: str) -> list[Path]:
@@ -170,16 +285,15 @@ def main() -> int:
     chosen = random.Random(told.seed).sample(every, min(told.count, len(every)))
     with tempfile.TemporaryDirectory() as folder:
         tree = Tree(Path(folder), told.room)
-        begun = time.monotonic()
-        if not tree.tests_pass(None):
-            raise SystemExit(f"the tests of {told.room} fail without any change")
-        timeout_s = LONGEST * (time.monotonic() - begun) + 10
+        coverage = tree.coverage()
         survivors = 0
         for number, mutation in enumerate(chosen, 1):
-            survived = tree.survives(mutation, timeout_s)
+            source = files[mutation.path]
+            tests = coverage.tests_of(mutation, source)
+            survived = tree.survives(mutation, {test: coverage.seconds[test] for test in tests})
             survivors += survived
-            outcome = "SURVIVED" if survived else "noticed"
-            print(f"{number}/{len(chosen)} {outcome} {mutation.describe(files[mutation.path])}", flush=True)
+            outcome = f"SURVIVED {len(tests)} tests of" if survived else "noticed"
+            print(f"{number}/{len(chosen)} {outcome} {mutation.describe(source)}", flush=True)
     share = 1 - survivors / max(len(chosen), 1)
     print(f"{told.room}: {len(chosen) - survivors} of {len(chosen)} mutations noticed ({share:.0%})")
     return int(share < told.at_least)
