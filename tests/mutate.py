@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import ast
 import copy
+import importlib
 import json
 import os
 import random
@@ -25,9 +26,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
-import cv2  # noqa: F401 - libraries that every fork would load
-import hypothesis  # noqa: F401
-import numpy as np  # noqa: F401
 import pytest
 from coverage import CoverageData
 
@@ -41,6 +39,9 @@ TESTS_OF = {
     "calib/similarity": ("calib/test_similarity.py", "calib/test_methods.py"),
 }
 OUTPUT = "output.txt"
+OPTIONS = ("-xq", "-m", "not slow", "-p", "no:cacheprovider", "-p", "no:xdist",
+           "-W", "ignore::pytest.PytestAssertRewriteWarning")  # fmt: skip
+LIBRARIES = ("PIL.Image", "cv2", "hypothesis.extra.numpy", "pydantic", "scipy.optimize", "scipy.stats", "typer")
 LONGEST = 5.0  # tests that take this many times longer than without a change have noticed it
 SWAPPED: dict[type[ast.AST], type[ast.AST]] = {
     ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
@@ -242,20 +243,7 @@ def _run_tests(folder: Path, told: Sequence[str], plugin: Chosen, seconds_file: 
         if seconds_file is None:
             os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
             sys.dont_write_bytecode = True
-        code = pytest.main(
-            [
-                "-x",
-                "-q",
-                "-m",
-                "not slow",
-                "-p",
-                "no:cacheprovider",
-                "-W",
-                "ignore::pytest.PytestAssertRewriteWarning",
-                *told,
-            ],
-            plugins=[plugin],
-        )
+        code = pytest.main([*OPTIONS, *told], plugins=[plugin])
         if seconds_file is not None:
             seconds_file.write_text(json.dumps(plugin.seconds))
     finally:
@@ -283,6 +271,8 @@ def main() -> int:
     files = {path: (ROOT / path).read_bytes() for path in files_of(told.room)}
     every = [mutation for path, source in files.items() for mutation in mutations_of(path, source)]
     chosen = random.Random(told.seed).sample(every, min(told.count, len(every)))
+    for name in LIBRARIES:  # which every fork would import
+        importlib.import_module(name)
     with tempfile.TemporaryDirectory() as folder:
         tree = Tree(Path(folder), told.room)
         coverage = tree.coverage()

@@ -48,7 +48,7 @@ def test_each_is_shown_for_its_time_from_when_the_first_was(folder: Path, opened
     times = (0, 1.9, 2.1, 4.9, 5.1, 5.9, 6.1, 8.5)
     shown = [colour_at(source, start + time) for time in times]
     assert shown == ["red", "red", "green", "green", "blue", "blue", "red", "green"]
-    assert source.info.name == "list: green (2 of 3)"
+    assert source.info.name == "list: green (2 of 3)" and source.info.moving
     told = source.describe(time_ns=round((start + 8.5) * NS_PER_S))
     assert told is not None and (told["index"], told["left_s"]) == (1, 2.5)
     assert [entry["seconds"] for entry in told["entries"]] == [2, 3, 1]
@@ -59,7 +59,12 @@ def test_one_that_does_not_repeat_stays_at_its_last(folder: Path, opened: Any) -
     assert [colour_at(source, time) for time in (0, 5.5, 100)] == ["red", "blue", "blue"]
     left_s = [source.describe(time_ns=round(time_s * NS_PER_S))["left_s"] for time_s in (1.5, 4.0, 5.5, 99.0)]
     assert left_s == [0.5, 1.0, None, None]
-    assert not source.skip(time_ns=101 * NS_PER_S)
+    assert [source.skip(time_ns=round(time_s * NS_PER_S)) for time_s in (1.5, 1.6, 1.7, 101.0)] == [
+        True,
+        True,
+        False,
+        False,
+    ]
 
 
 def test_the_next_one_can_be_asked_for(folder: Path, opened: Any) -> None:
@@ -102,11 +107,24 @@ def test_a_list_that_is_wrong_is_one_line_that_names_its_entry(
     assert refusal(opened, path).startswith(f"{path}: {told}")
 
 
+@pytest.mark.parametrize(
+    ("name", "text", "told"),
+    [
+        ("list.json", '{"frames": []}', "is a set of cameras for training a NeRF"),
+        ("list.json", "{}", "show: is missing; a JSON file must be a playlist"),
+        ("list.toml", "", "show: Field required"),
+    ],
+)
+def test_a_file_without_scenes_is_no_list(tmp_path: Path, name: str, text: str, told: str) -> None:
+    (tmp_path / name).write_text(text)
+    assert told in refusal(read_playlist, tmp_path / name, ContentSettings())
+
+
 class Inner(ContentSource):
     """Scene that keeps the times it was asked for."""
 
     def __init__(self, name: str) -> None:
-        self.info, self.closed = ContentInfo(name, moving=False, background=None), 0
+        self.info, self.closed = ContentInfo(name, moving=True, background=None), 0
         self.picture = np.zeros((STACK.height_px, STACK.width_px, 4), np.uint8)
         self.asked_ns: list[int] = []
 
@@ -127,6 +145,7 @@ def inner(folder: Path) -> tuple[PlaylistSource, list[Inner]]:
 
 def test_each_scene_has_a_time_that_begins_when_it_is_shown(inner: tuple[PlaylistSource, list[Inner]]) -> None:
     source, scenes = inner
+    assert source.info.name == "list: red (1 of 3)"
     for time_s in (100.0, 101.5, 102.0, 104.5, 106.0, 110.25):
         source.render(panel_view(EYE, STACK.panel(1)), time_ns=round(time_s * NS_PER_S))
     shown_s = [[ns / NS_PER_S for ns in scene.asked_ns] for scene in scenes]
@@ -139,11 +158,18 @@ def test_closing_a_playlist_closes_every_scene(inner: tuple[PlaylistSource, list
     assert [scene.closed for scene in scenes] == [1, 1, 1]
 
 
+def test_scenes_are_closed_if_a_later_one_cannot_be_shown(folder: Path) -> None:
+    first, playlist = Inner("red"), read_playlist(written(folder, *THREE), ContentSettings())
+    with pytest.raises(ZeroDivisionError):
+        PlaylistSource(playlist, [lambda context: first, lambda context: 1 // 0], context=None)
+    assert first.closed == 1
+
+
 def test_no_revision_comes_back_when_a_later_round_is_skipped_through(
     inner: tuple[PlaylistSource, list[Inner]],
 ) -> None:
     source, _ = inner
-    times_ns = [round(time_s * NS_PER_S) for time_s in (50.0, 52.5, 55.5, 56.5, 58.5)]
+    times_ns = [round(time_s * NS_PER_S) for time_s in (50.0, 51.0, 52.5, 55.5, 56.5, 58.5)]
     seen = [source.revision(time_ns=time_ns) for time_ns in times_ns]
     for time_ns in (times_ns[-1], times_ns[-1] + NS_PER_S // 2, times_ns[-1] + NS_PER_S):
         assert source.skip(time_ns=time_ns)

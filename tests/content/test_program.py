@@ -34,7 +34,7 @@ from websockets.typing import Subprotocol
 from runtime.config import ContentSettings, StackGeometry
 from runtime.content import program_link, program_server
 from runtime.content.placed import Placing, placed_source
-from runtime.content.program import camera_of
+from runtime.content.program import camera_of, nearness_of
 from runtime.content.program_link import ProgramLink
 from runtime.content.registry import open_content
 from runtime.daemon.programs import Programs
@@ -145,6 +145,7 @@ def test_both_eyes_are_asked_for_at_once_and_get_their_own_picture(either: Any) 
     program = Program(either)
     left, right = drawn(either, time_ns=1_500_000_000)
     (asked,) = program.asked
+    assert either.info.moving and either.info.fixed_views
     assert (asked["width"], asked["height"], asked["time_s"]) == (64, 36, 1.5)
     assert [eye["eye"] for eye in asked["eyes"]] == ["left", "right"]
     assert (left[..., 0] == 200).all() and (right[..., 0] == 100).all() and (left[:, 5, 1] == np.arange(36)).all()
@@ -254,6 +255,16 @@ def test_a_picture_that_was_not_asked_for_is_left(source: Any) -> None:
     source.expect([view], time_ns=0)
     with pytest.raises(ContentFailure, match="did not answer"):  # it answers for the left eye
         source.render(view, time_ns=0)
+    program.end()
+
+
+def test_a_view_that_was_not_announced_is_asked_for(source: Any) -> None:
+    program = Program(source)
+    before, after = (raster_views(EYES + shift, STACK.panel(0))[0] for shift in (0.0, 0.01))
+    source.expect([before], time_ns=0)
+    for view in (before, after, after):
+        source.render(view, time_ns=0)
+    assert [asked["eyes"][0]["eye_m"] for asked in program.asked] == [before.eye_m.tolist(), after.eye_m.tolist()]
     program.end()
 
 
@@ -463,6 +474,7 @@ def plane_and_background(asked: dict, eye: dict, dtype: str) -> bytes:
 def test_a_program_may_send_depth(source: Any, dtype: str, scale: float, first: tuple[int, int]) -> None:
     program = Program(source, partial(plane_and_background, dtype=dtype), depth=dtype, scale=scale)
     views = raster_views(EYES, STACK.panel(0))
+    assert source.nearness(views[0], every=4, first=first) is None
     source.expect(views, time_ns=0)
     for view in views:
         source.render(view, time_ns=0)
@@ -472,6 +484,11 @@ def test_a_program_may_send_depth(source: Any, dtype: str, scale: float, first: 
         np.testing.assert_allclose(nearness[6:9, :7], 1 / 0.6, rtol=1e-3)
         assert (nearness[:, 9:] == 0).all()
     program.end()
+
+
+def test_depths_from_the_near_to_the_far_plane_are_inverse_distances() -> None:
+    depth = np.array([[0.0, 0.5, 1.0, -0.1]], np.float32)
+    np.testing.assert_allclose(nearness_of(depth, every=1, first=(0, 0)), [[20.0, 10.005, 0.0, 0.0]], rtol=1e-6)
 
 
 def test_a_program_on_the_same_machine_may_share_memory(either: Any) -> None:
@@ -574,6 +591,8 @@ def test_a_port_that_is_taken_is_refused(source: Any) -> None:
     port = int(source.program["address"].partition("127.0.0.1:")[2].partition("/")[0])
     with pytest.raises(InputError, match=f"port: cannot listen on port {port}"):
         open_content(ContentSettings(scene="program", options={"port": port}), STACK, None)
+    with pytest.raises(InputError, match="content.options: port: "):
+        open_content(ContentSettings(scene="program", options={"port": 65536}), STACK, None)
 
 
 def test_the_example_draws_a_cube_for_each_eye(source: Any) -> None:
