@@ -70,7 +70,7 @@ def test_one_that_does_not_repeat_stays_at_its_last(folder: Path, opened: Any) -
 def test_the_next_one_can_be_asked_for(folder: Path, opened: Any) -> None:
     source = opened(written(folder, *THREE))
     assert colour_at(source, 50.0) == "red"
-    assert source.skip(time_ns=round(50.5 * NS_PER_S))
+    assert source.skip(time_ns=round(50.5 * NS_PER_S)) and source.info.name == "list: green (2 of 3)"
     assert colour_at(source, 50.6) == "green"
     assert colour_at(source, 53.4) == "green" and colour_at(source, 53.6) == "blue"
 
