@@ -36,7 +36,6 @@ TESTS_OF = {
     "plan": ("plan", "frame"),
     "browser": ("daemon", "browser"),
     "page": ("page", "browser"),
-    "calib/similarity": ("calib/test_similarity.py", "calib/test_methods.py"),
 }
 OUTPUT = "output.txt"
 OPTIONS = ("-xq", "-m", "not slow", "-p", "no:cacheprovider", "-p", "no:xdist",
@@ -82,18 +81,21 @@ def mutations_of(path: Path, source: bytes) -> Iterator[Mutation]:
     starts = [0]
     for line in source.splitlines(keepends=True):
         starts.append(starts[-1] + len(line))
-    for node in ast.walk(_without_annotations(ast.parse(source))):
+    for node in ast.walk(_without_declarations(ast.parse(source))):
         for changed in _changed(node):
             start, end = starts[node.lineno - 1] + node.col_offset, starts[node.end_lineno - 1] + node.end_col_offset
             text = f"({ast.unparse(changed)})" if isinstance(changed, ast.expr) else ast.unparse(changed)
             yield Mutation(path, start, end, text.encode())
 
 
-def _without_annotations(tree: ast.Module) -> ast.Module:
+def _without_declarations(tree: ast.Module) -> ast.Module:
+    """Return a tree without annotations, and without `frozen` and `slots`, which alter nothing that runs."""
     for node in ast.walk(tree):
         for name in ("annotation", "returns"):
             if getattr(node, name, None) is not None:
                 setattr(node, name, ast.Constant(None, lineno=1, col_offset=0, end_lineno=1, end_col_offset=0))
+        if isinstance(node, ast.ClassDef):
+            node.decorator_list = [one for one in node.decorator_list if not ast.unparse(one).startswith("dataclass(")]
     return tree
 
 
@@ -179,7 +181,7 @@ class Tree:
         """Run the tests of the room, or of its part, without a change, and return what each runs."""
         room, _, part = self.room.partition("/")
         own = (f"{room}/test_{part}.py",) if (self.folder / f"tests/{room}/test_{part}.py").exists() else (room,)
-        places = [f"tests/{name}" for name in TESTS_OF.get(self.room, TESTS_OF.get(room, own))]
+        places = [f"tests/{name}" for name in TESTS_OF.get(room, own)]
         seconds_file, told = self.folder / "seconds.json", ("--cov", "--cov-context=test", "--cov-report=")
         if self._code_of_tests((*told, "--cov-fail-under=0", *places), Chosen(), None, seconds_file) != 0:
             raise SystemExit(f"{(self.folder / OUTPUT).read_text()}the tests of {self.room} fail without any change")

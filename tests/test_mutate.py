@@ -9,6 +9,9 @@ from tests.mutate import files_of, mutations_of
 SOURCE = '''"""Ünïcode before the places that are changed."""
 LIMIT: int | 3 = 4
 
+@dataclass(frozen=True)
+class Empty: pass
+
 def is_wide(é: int = 0) -> 2:
     log.info("no change")
     close(é)

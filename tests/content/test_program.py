@@ -591,7 +591,7 @@ def test_a_port_that_is_taken_is_refused(source: Any) -> None:
     port = int(source.program["address"].partition("127.0.0.1:")[2].partition("/")[0])
     with pytest.raises(InputError, match=f"port: cannot listen on port {port}"):
         open_content(ContentSettings(scene="program", options={"port": port}), STACK, None)
-    with pytest.raises(InputError, match="content.options: port: "):
+    with pytest.raises(InputError, match=r"content\.options: port: "):
         open_content(ContentSettings(scene="program", options={"port": 65536}), STACK, None)
 
 
