@@ -223,7 +223,7 @@ def _film_layout(film: Film, settings: ContentSettings, picture: U8) -> Layout:
         log.warning("%s: showing the film without %s", path, stated.left_out)
     layout = layout_of(path, settings, stated=stated.layout)
     if is_pair := stated.views == 2 and settings.layout != "mono":
-        layout = replace(PAIR, right_first=layout.right_first)
+        layout = replace(PAIR, right_first=layout.right_first or stated.right_first)
     layout = replace(layout, sample_aspect=stated.pixel_aspect)
     if settings.layout == "auto" and not is_pair:
         layout = replace(layout, right_first=layout.right_first or stated.right_first)

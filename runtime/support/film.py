@@ -16,6 +16,7 @@ from typing import Any, cast
 
 import av
 import numpy as np
+from av.sidedata.sidedata import Type as SideData
 from numpy.typing import NDArray
 
 from runtime.clock import NS_PER_MS, NS_PER_S
@@ -33,6 +34,7 @@ WITH_ALPHA = {"vp8": "libvpx", "vp9": "libvpx-vp9"}  # decoders of the transpare
 STEREO = {1: "side-by-side", 2: "top-bottom"}  # FFmpeg's AVStereo3DType
 # FFmpeg's AVStereo3DType from 3 to 8
 UNSEEN = "alternating frames", "checkerboard", "quincunx", "alternating rows", "alternating columns", "MV-HEVC"
+VIEW_ID, RIGHT = "29", 2  # FFmpeg's AV_FRAME_DATA_VIEW_ID, which PyAV does not name, and AVStereo3DView
 BT709, UNSPECIFIED = 1, 2  # AVColorSpace
 RECTILINEAR = 4  # AVSphericalProjection
 
@@ -64,7 +66,7 @@ class FilmHeader:
     is_around: bool = False  # True if the pictures show a half or a full sphere
     left_out: str = ""  # description of a view that is declared but not supported
     pixel_aspect: float = 1.0  # pixel width divided by pixel height
-    views: int = 1  # 2 if the left and right view are separate streams
+    views: int = 1  # 2 if the left and right view are separate streams, or MV-HEVC
     right_first: bool = False  # True if the right eye's view comes first
 
 
@@ -81,7 +83,7 @@ class Film:
         if first is None:
             raise InputError(path, "frames", "the first frame cannot be decoded")
         self._start_ns = first[0]
-        self.header = _header(first[1][0], self._streams)
+        self.header = _header(first[1], self._streams[0])
         # (n + 1,) times at which each frame begins and the last one ends, in ns from the first frame
         self.times_ns = self._times() if times_ns is None else times_ns
 
@@ -115,6 +117,8 @@ class Film:
             if stream.metadata.get("alpha_mode") == "1" and name in av.codecs_available:
                 decoder = av.CodecContext.create(name, "r")
                 decoder.extradata = stream.codec_context.extradata
+            if decoder.name == "hevc":
+                decoder.options = {"view_ids": "-1"}  # all views of MV-HEVC
             decoder.thread_type = "AUTO"
             self._decoders[stream.index] = decoder
 
@@ -172,13 +176,28 @@ class Film:
                 since_ns = 0
         if since_ns <= 0:
             self._open()
+        for frames in self._grouped():
+            stamp, base = frames[0].dts if frames[0].pts is None else frames[0].pts, frames[0].time_base
+            yield 0 if stamp is None else round(stamp * float(base or 1) * NS_PER_S) - self._start_ns, frames
+
+    def _grouped(self) -> Iterator[tuple[av.VideoFrame, ...]]:
+        """Yield the frames of each picture. The views of MV-HEVC follow each other, with the same time. If one is
+        missing, the other one is for both eyes.
+        """
         waiting: dict[int, deque[av.VideoFrame]] = {stream.index: deque() for stream in self._streams}
+        view: av.VideoFrame | None = None
         for index, frame in self._decoded():
+            if VIEW_ID in _side_data(frame):
+                is_second = view is not None and view.pts == frame.pts
+                if view is not None:
+                    yield view, frame if is_second else view
+                view = None if is_second else frame
+                continue
             waiting[index].append(frame)
             while all(waiting.values()):
-                frames = tuple(queue.popleft() for queue in waiting.values())
-                stamp, base = frames[0].dts if frames[0].pts is None else frames[0].pts, frames[0].time_base
-                yield 0 if stamp is None else round(stamp * float(base or 1) * NS_PER_S) - self._start_ns, frames
+                yield tuple(queue.popleft() for queue in waiting.values())
+        if view is not None:
+            yield view, view
 
     def _decoded(self) -> Iterator[tuple[int, av.VideoFrame]]:
         """Yield decoded frames with their stream's number. Interlaced frames are converted to progressive ones."""
@@ -267,21 +286,36 @@ class FilmWriter:
         self._container.close()
 
 
-def _header(frame: av.VideoFrame, streams: list[Any]) -> FilmHeader:
-    """Return a film's declarations, as FFmpeg reports them with the first frame."""
-    stream, items = streams[0], cast(Any, frame.side_data)
-    side = {item.type.name: bytes(item) for item in items}
-    kind, flags = struct.unpack_from("<ii", side.get("STEREO3D", bytes(8)))
+def _unnamed(kinds: type[SideData], value: int) -> Any:
+    """Return a kind of side data that PyAV does not name, for which it would refuse all side data of the frame."""
+    kind: Any = object.__new__(kinds)
+    kind._name_, kind._value_ = str(value), value
+    return kind
+
+
+SideData._missing_ = classmethod(_unnamed)  # type: ignore[assignment, method-assign]
+
+
+def _side_data(frame: av.VideoFrame) -> dict[str, bytes]:
+    """Return what FFmpeg reports with a frame, by the names of AVFrameSideDataType."""
+    return {item.type.name: bytes(item) for item in cast(Any, frame.side_data)}
+
+
+def _header(frames: tuple[av.VideoFrame, ...], stream: Any) -> FilmHeader:
+    """Return a film's declarations, as FFmpeg reports them with the first picture."""
+    frame, views = frames[0], len(frames)
+    side = _side_data(frame)
+    kind, flags, view = struct.unpack_from("<3i", side.get("STEREO3D", bytes(12)))
     layout = STEREO.get(kind, "")
     if stream.metadata.get("stereo_mode", "").startswith("anaglyph_cyan"):
         layout = "anaglyph"
-    left_out = f"its second view ({UNSEEN[kind - 3]}); convert it to side by side" if 3 <= kind <= 8 else ""
+    is_unseen = views == 1 and 3 <= kind <= 8
+    left_out = f"its second view ({UNSEEN[kind - 3]}); convert it to side by side" if is_unseen else ""
+    right_first = view == RIGHT or bool((layout or views == 2) and flags & 1)
     aspect = float(stream.sample_aspect_ratio or 1) or 1.0
     aspect = aspect if frame.rotation % 180 == 0 else 1 / aspect
     projection = struct.unpack_from("<i", side.get("SPHERICAL", RECTILINEAR.to_bytes(4, "little")))[0]
-    return FilmHeader(
-        layout, projection != RECTILINEAR, left_out, aspect, len(streams), right_first=bool(layout and flags & 1)
-    )
+    return FilmHeader(layout, projection != RECTILINEAR, left_out, aspect, views, right_first)
 
 
 def _progressive(frame: av.VideoFrame) -> Any:
@@ -304,7 +338,6 @@ def rgb_of(frame: av.VideoFrame, background: Colour = (0.0, 0.0, 0.0)) -> U8:
         picture = np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
     if frame.color_trc in BRIGHT:
         picture = srgb_from(picture, primaries=frame.color_primaries, transfer=frame.color_trc)
-    matrix = next((bytes(item) for item in cast(Any, frame.side_data) if item.type.name == "DISPLAYMATRIX"), bytes(36))
-    a, b, c, d = struct.unpack_from("<2i4x2i", matrix)
+    a, b, c, d = struct.unpack_from("<2i4x2i", _side_data(frame).get("DISPLAYMATRIX", bytes(36)))
     upright = picture[::-1] if a * d < b * c else picture  # mirrored, as some phones record their front camera
     return np.ascontiguousarray(np.rot90(upright, round(frame.rotation / 90) % 4))

@@ -88,6 +88,16 @@ def test_stated_stereo_that_is_not_shown_is_logged(tmp_path: Path, caplog: Any) 
     assert "a.mp4: showing the film without its second view (MV-HEVC)" in caplog.text
 
 
+def test_both_views_of_mv_hevc_are_shown(tmp_path: Path) -> None:
+    spatial = Path(__file__).parent / "data" / "spatial.mp4"  # by x265 4.1, with the boxes of Apple's spatial films
+    swapped = spatial.read_bytes().replace(b"\x04\x0d\x00\x10", b"\x04\x0a\x80\x10")  # the base view is the right eye's
+    (tmp_path / "a.mp4").write_bytes(swapped)
+    for path, seen in ((spatial, ["red", "blue"]), (tmp_path / "a.mp4", ["blue", "red"])):
+        frames = open_frames(path, AUTO)
+        assert [middle(view) for n in range(3) for view in frames.layout(n).views(frames.frame(n))] == seen * 3
+    assert views_of(spatial, layout="mono") == ["red"]
+
+
 def test_a_film_all_around_is_refused(tmp_path: Path) -> None:
     for added, into in ((equirectangular(), {}), (spherical_xml("top-bottom"), {"into": (b"moov", b"trak")})):
         with pytest.raises(InputError, match=r"a\.mp4: shows all directions"):
