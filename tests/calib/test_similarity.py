@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calib.similarity import Degenerate, fit, fit_batch, fit_robust
+from calib.similarity import Degenerate, ScaleRule, extents, fit, fit_batch, fit_robust
 from calib.viewpoints import viewing_volume_m
 from tests.calib.camera import KNOWN_M, measured
 
@@ -39,6 +41,33 @@ def test_exact_pairs_give_the_similarity_back(
     assert found.scale == pytest.approx(scale, rel=1e-9)
     np.testing.assert_allclose(found.rotation, rotation.as_matrix(), atol=1e-9)
     np.testing.assert_allclose(found.translation_m, shift, atol=1e-7)
+    moved = found.matrix @ [1.0, 2.0, 3.0, 1.0]
+    np.testing.assert_allclose(moved, [*(scale * rotation.apply([1.0, 2.0, 3.0]) + shift), 1.0], rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("rule", [*RULES, 0.02])
+def test_a_long_thin_cloud_is_turned_as_well_about_its_length(rule: ScaleRule) -> None:
+    points = np.random.default_rng(0).normal(size=(27, 3)) * [1e-5, 1.0, 2e-5] + [0.5, 0.0, 0.1]
+    rotation, shift = Rotation.from_rotvec([0.3, 1.0, -2.0]), np.array([1.0, 2.0, 3.0])
+    found = fit(camera(points, rotation=rotation, scale=0.02, shift=shift), points, rule=rule)
+    assert found.scale == pytest.approx(0.02, rel=1e-12)
+    np.testing.assert_allclose(found.rotation, rotation.as_matrix(), atol=1e-10)
+    np.testing.assert_allclose(found.translation_m, shift, atol=1e-8)
+
+
+def test_extents_are_rms_lengths_along_the_principal_axes_largest_first() -> None:
+    points = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 3, 0], [0, -3, 0], [0, 0, 2], [0, 0, -2]]) + 7.0
+    np.testing.assert_allclose(extents(points) ** 2, [3.0, 4 / 3, 1 / 3], rtol=1e-12)
+    assert extents(np.array([[0.0, 0, 0], [0, 2, 0]])).tolist() == [1, 0, 0]
+    assert extents(np.ones((4, 3))).tolist() == [0, 0, 0]
+
+
+def test_points_are_refused_from_where_rounding_turns_by_a_microradian() -> None:
+    points = cloud(0, 5)
+    far = points + np.array([extents(points)[1] / (4 * np.finfo(float).eps) * 1e-6, 0.0, 0.0])
+    fit(points, 0.9 * (far - points) + points, rule="inverse")
+    with pytest.raises(Degenerate, match="double precision"):
+        fit(points, 1.1 * (far - points) + points, rule="inverse")
 
 
 def test_noise_on_the_sensors_side_shrinks_least_squares_and_not_inverse() -> None:
@@ -48,6 +77,9 @@ def test_noise_on_the_sensors_side_shrinks_least_squares_and_not_inverse() -> No
     shrunk, true = (fit_batch(sensor, points, rule=rule).scale.mean() for rule in ("least-squares", "inverse"))
     assert shrunk < 0.95
     assert true == pytest.approx(1.0, abs=0.02)
+    each = [fit_batch(sensor, points, rule=rule).scale for rule in ("seed", "least-squares", "inverse")]
+    np.testing.assert_allclose(each[0] ** 2, each[1] * each[2])  # `seed` is the geometric mean
+    assert (fit_batch(sensor, points, rule=0.5).scale == 0.5).all()
 
 
 @pytest.mark.parametrize(
@@ -55,6 +87,7 @@ def test_noise_on_the_sensors_side_shrinks_least_squares_and_not_inverse() -> No
     [
         (cloud(0, 2), "at least 3"),
         (np.ones((5, 3)), "coincide"),
+        (np.zeros((5, 3)), "coincide"),
         (np.outer(np.arange(5.0), [1, 2, 3]), "one line"),
         (np.outer(np.arange(5.0), [1, 2, 3]) + 1e-8 * cloud(0, 5), "double precision"),
         (1e12 + cloud(0, 5), "double precision"),
@@ -66,6 +99,13 @@ def test_points_that_determine_nothing_are_refused(points: NDArray[np.float64], 
         fit(points, points, rule="inverse")
     with pytest.raises(Degenerate, match=why):
         fit(points, cloud(0, len(points)), rule="inverse")
+
+
+@pytest.mark.parametrize("rule", ["least-squares", "inverse"])
+def test_points_without_correlation_are_refused(rule: ScaleRule) -> None:
+    cube = np.array(list(product((-1.0, 1.0), repeat=3)))
+    with pytest.raises(Degenerate, match="not correlated"):
+        fit(cube, cube * np.roll(cube, 1, axis=1), rule=rule)
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
@@ -95,10 +135,27 @@ def test_exactly_the_wrong_pairs_are_left_out(sigma_m: float, wrong: list[int]) 
     assert np.flatnonzero(~found.inlier).tolist() == wrong
 
 
+@pytest.mark.parametrize(("count", "left_out"), [(5, []), (6, [1]), (7, [1])])
+def test_five_pairs_have_no_majority_and_six_have_one(count: int, left_out: list[int]) -> None:
+    known = KNOWN_M[[0, 5, 7, 13, 17, 22, 26][:count]]
+    found = fit_robust(spoiled(measured(known, sigma_m=0.001), [1]), known)
+    assert np.flatnonzero(~found.inlier).tolist() == left_out
+
+
+def test_a_majority_with_noise_outvotes_pairs_that_agree_exactly() -> None:
+    wrong = np.arange(1, 23, 2)  # 11 of 27
+    sensor = measured(sigma_m=0.003)
+    sensor[wrong] = measured(KNOWN_M + np.array([0.1, 0.2, 0.0]))[wrong]
+    assert np.array_equal(np.flatnonzero(~fit_robust(sensor, KNOWN_M).inlier), wrong)
+
+
 def test_many_pairs_are_scored_by_a_sample_and_rejected_one_by_one() -> None:
     volume = viewing_volume_m()
     points = np.random.default_rng(0).uniform(volume.min(0), volume.max(0), size=(5000, 3))
     wrong = list(range(0, 5000, 5))
-    found = fit_robust(spoiled(measured(points, sigma_m=0.003), wrong), points)
+    sensor = spoiled(measured(points, sigma_m=0.003), wrong)
+    sensor[[1, 2]] = measured(points)[[1, 2]] + [[4.2 * 0.003, 0.0, 0.0], [0.0, 5.0 * 0.003, 0.0]]
+    found = fit_robust(sensor, points)
     assert not found.inlier[wrong].any()
+    assert found.inlier[[1, 2]].tolist() == [True, False]  # the limit is 4.6 standard deviations
     assert found.inlier.sum() >= 0.998 * 4000
