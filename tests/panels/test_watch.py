@@ -119,8 +119,8 @@ def test_a_refused_request_makes_it_look_at_everything_at_once(x: XServer, opene
     sink = opened(*BY_CONNECTOR)
     windows = sink._windows.windows
     watch = PlacementWatch(sink._display, sink.monitors, windows, SimulatedClock())  # whose time never comes
-    x.do_to_window("XDestroyWindow", x11_window(sink, 2))
+    x.do_to_window("XDestroyWindow", x11_window(sink, 0))
     x.xrandr("--query")
     assert watch.look() == ""
-    assert sink._display.window_state(windows[2]) is None  # refused
-    assert watch.look() == "panel 2: the window was destroyed"
+    assert sink._display.window_state(windows[0]) is None  # refused
+    assert watch.look() == "panel 0: the window was destroyed"
