@@ -38,14 +38,14 @@ libusb (LGPL-2.1) and OpenNI2 (Apache-2.0).
 """
 
 
-def locked() -> dict[str, str]:
-    """Return the versions of the runtime's packages, keyed by name."""
+def locked() -> list[str]:
+    """Return the names of the runtime's packages."""
     text = (ROOT / "requirements" / "runtime.lock").read_text(encoding="utf-8")
-    return dict(re.findall(r"^([A-Za-z0-9._-]+)==([^ \\\n]+)", text, re.MULTILINE))
+    return re.findall(r"^([A-Za-z0-9._-]+)==", text, re.MULTILINE)
 
 
 def licences(names: list[str]) -> list[dict[str, str]]:
-    """Return installed packages' `Name`, `Version`, `License` and `URL` entries, sorted by name."""
+    """Return installed packages' `Name`, `License` and `URL` entries, sorted by name."""
     command = [
         str(Path(sys.executable).parent / "pip-licenses"),
         "--from=mixed",
@@ -59,10 +59,13 @@ def licences(names: list[str]) -> list[dict[str, str]]:
 
 
 def page(packages: list[dict[str, str]]) -> str:
-    """Format the page."""
-    rows = [f"* [{one['Name']}]({one['URL']}) {one['Version']}: {one['License']}\n" for one in packages]
+    """Format the page, with the packages grouped by licence."""
+    groups: dict[str, list[str]] = {}
+    for one in packages:
+        groups.setdefault(one["License"], []).append(f"[{one['Name']}]({one['URL']})")
+    rows = [f"* {licence}: {', '.join(links)}\n" for licence, links in sorted(groups.items())]
     return HEAD + "".join(rows) + TAIL
 
 
 if __name__ == "__main__":
-    PAGE.write_text(page(licences(list(locked()))), encoding="utf-8")
+    PAGE.write_text(page(licences(locked())), encoding="utf-8")
