@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import select
 import time
+from collections.abc import Sequence
 from typing import Protocol
 
 NS_PER_S = 1_000_000_000
@@ -18,6 +20,11 @@ class Clock(Protocol):
     def sleep_until_ns(self, deadline_ns: int) -> None:
         """Sleep until the deadline, or return immediately if it has passed."""
 
+    def is_readable(self, descriptors: Sequence[int], *, until_ns: int) -> bool:
+        """Wait for one of the file descriptors to become readable, until the deadline or up to 1 ms less.
+        Return False if none has. Simulated time does not pass, and nothing arrives in it.
+        """
+
 
 class MonotonicClock:
     """Clock that reads the operating system's monotonic time."""
@@ -29,6 +36,15 @@ class MonotonicClock:
         remaining_ns = deadline_ns - time.monotonic_ns()
         if remaining_ns > 0:
             time.sleep(remaining_ns / NS_PER_S)
+
+    def is_readable(self, descriptors: Sequence[int], *, until_ns: int) -> bool:
+        whole_ms = (until_ns - time.monotonic_ns()) // NS_PER_MS  # the system would round up
+        if whole_ms <= 0 or not descriptors:
+            return False
+        poll = select.poll()
+        for descriptor in descriptors:
+            poll.register(descriptor, select.POLLIN)
+        return bool(poll.poll(whole_ms))
 
 
 class SimulatedClock:
@@ -42,6 +58,9 @@ class SimulatedClock:
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
         self._now_ns = max(self._now_ns, deadline_ns)
+
+    def is_readable(self, descriptors: Sequence[int], *, until_ns: int) -> bool:
+        return False
 
     def advance_ns(self, duration_ns: int) -> None:
         """Advance the simulated time. Raises ValueError if the duration is negative."""

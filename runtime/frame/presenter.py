@@ -2,7 +2,8 @@
 
 At each refresh, the presenter takes in the samples that have arrived, predicts the eyes at the display time, aligns the
 latest solution to them, presents it and records the result. The loop only ever waits for a refresh's time slot and, on
-outputs without vertical blanks, for the time when its frame is due.
+outputs without vertical blanks, for the time when its frame is due. In the first of these waits, it takes in samples
+and solutions as they arrive, so that little is left to do between waking and presenting.
 The solver (`solver_host`) runs in parallel and delivers complete solutions.
 """
 
@@ -49,6 +50,9 @@ from runtime.records import (
 from runtime.sensor.samples import Samples
 
 log = logging.getLogger("phasestack.presenter")
+
+UNDISTURBED_NS = NS_PER_MS  # nothing is taken in for this long before a refresh wakes, because it could delay it
+TAKEN_IN_MOST = 8  # how often something is taken in while waiting for one refresh
 
 
 class Supervisor:
@@ -135,8 +139,7 @@ class Presenter:
         """Carry out one refresh. Raises EndOfRecording, or FatalError if the sensor has failed permanently."""
         times = RefreshTimes(self.clock, self._stage_ms)
         timing = self.pacer.predict(self.clock.now_ns())
-        self.clock.sleep_until_ns(timing.wake_ns)
-        times.lap("wait")
+        self._wait(timing.wake_ns, times)
         woke_ns = self.clock.now_ns()
         self._supervisor.carry_out_commands(self)
         self._receive(woke_ns)
@@ -173,6 +176,18 @@ class Presenter:
         """Use other settings, and perhaps another calibration, from now on."""
         self.settings = settings
         self.viewer.adopt(settings, calibration)
+
+    def _wait(self, wake_ns: int, times: RefreshTimes) -> None:
+        for _ in range(TAKEN_IN_MOST):  # a process that has ended keeps its channel readable
+            sources = [each for each in (self.samples.descriptor, self.solver.descriptor) if each is not None]
+            if not self.clock.is_readable(sources, until_ns=wake_ns - UNDISTURBED_NS):
+                break
+            times.lap("wait")
+            self._receive(self.clock.now_ns())
+            self.solver.news()
+            times.lap("sensor")
+        self.clock.sleep_until_ns(wake_ns)
+        times.lap("wait")
 
     def _receive(self, now_ns: int) -> None:
         for sample in self.samples.arrived(now_ns):

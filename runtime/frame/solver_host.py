@@ -53,6 +53,7 @@ class SolverHost(ABC):
     """
 
     restarts = 0  # how many solvers have been replaced
+    descriptor: int | None = None  # file descriptor that is readable when there may be news; None: unknown
 
     def __init__(self) -> None:
         self._sent = 0

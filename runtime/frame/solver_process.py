@@ -102,6 +102,10 @@ class SolverProcess(SolverHost):
         return self._worker.restarts
 
     @property
+    def descriptor(self) -> int | None:  # type: ignore[override]
+        return self._worker.descriptor
+
+    @property
     def costs(self) -> Costs:
         return self._costs
 

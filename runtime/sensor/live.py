@@ -143,6 +143,10 @@ class SensorProcess(LiveSamples):
         self._worker = Worker(role, lambda: (setup,))
         self._is_started = self._has_begun = self._was_well = False
 
+    @property
+    def descriptor(self) -> int | None:  # type: ignore[override]
+        return self._worker.descriptor
+
     def _begin(self, go_on: Callable[[], bool]) -> None:
         self._worker.wait_ready(go_on)
         self._is_started = True

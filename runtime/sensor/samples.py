@@ -31,6 +31,7 @@ class Samples(ABC):
 
     stale_inputs: int  # number of samples replaced by a newer one before use
     serial: str  # the sensor's serial number; empty: unknown
+    descriptor: int | None = None  # file descriptor that is readable when samples have arrived; None: unknown
 
     @abstractmethod
     def arrived(self, now_ns: int) -> list[SensorFrame]:

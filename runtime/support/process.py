@@ -163,6 +163,11 @@ class Worker:
         """Why no process is ready, or an empty string."""
         return "" if self.is_ready else f"{self._last_reason or f'the {self.role.name} is starting'}"
 
+    @property
+    def descriptor(self) -> int | None:
+        """File descriptor that is readable when `receive` has messages, or None while there is no process."""
+        return self._lives[0].channel.fileno() if self._lives else None
+
     def send(self, message: Any) -> bool:
         """Send a message. Return False if the process is not ready or has too many messages unread."""
         life = self._newest

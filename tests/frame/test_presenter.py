@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime.clock import NS_PER_MS, NS_PER_S
+from runtime.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from runtime.frame.aim import HORIZON_NS
 from runtime.optics.alignment import align
 from runtime.plan.savings import selected_eyes
@@ -31,6 +32,45 @@ def stage() -> Stage:
     made.solver.hand_over(solved=solution(2))
     made.refresh(5)
     return made
+
+
+# --- waiting -----------------------------------------------------------------------------------------------------
+
+
+def test_what_arrives_during_the_wait_is_taken_in_before_waking(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    taken_ns, left_ns = [], [9 * NS_PER_MS, 5 * NS_PER_MS]
+    monkeypatch.setattr(stage.watching, "sampled", lambda sample: taken_ns.append(stage.clock.now_ns()))
+
+    def is_readable(descriptors: list[int], *, until_ns: int) -> bool:
+        if not left_ns:
+            return False
+        stage.clock.sleep_until_ns(until_ns - left_ns.pop(0))
+        stage.samples.put(EYES, stage.clock.now_ns())
+        return True
+
+    monkeypatch.setattr(stage.clock, "is_readable", is_readable)
+    account = stage.presenter.refresh()
+    assert taken_ns[1] - taken_ns[0] == 4 * NS_PER_MS
+    assert account.capture_ns == taken_ns[1] < account.present_ns - 5 * NS_PER_MS
+
+
+def test_an_ended_process_does_not_keep_the_presenter_waiting(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its channel stays readable although nothing arrives."""
+    monkeypatch.setattr(stage.clock, "is_readable", lambda descriptors, *, until_ns: True)
+    before_ns = stage.presenter.refresh().present_ns
+    assert stage.presenter.refresh().present_ns - before_ns == pytest.approx(PERIOD_NS, rel=0.01)
+
+
+def test_the_real_clock_waits_for_the_first_descriptor_to_be_readable() -> None:
+    clock, (ours, theirs) = MonotonicClock(), socket.socketpair()
+    with ours, theirs:
+        until_ns = clock.now_ns() + 30 * NS_PER_MS
+        assert not clock.is_readable([ours.fileno()], until_ns=until_ns)
+        assert clock.now_ns() > until_ns - 2 * NS_PER_MS
+        assert not clock.is_readable([], until_ns=clock.now_ns() + NS_PER_S)
+        theirs.send(b"1")
+        assert clock.is_readable([ours.fileno()], until_ns=clock.now_ns() + 60 * NS_PER_S)
+        assert not clock.is_readable([ours.fileno()], until_ns=clock.now_ns())
 
 
 # --- alignment ---------------------------------------------------------------------------------------------------
