@@ -37,7 +37,8 @@ def moved_m2(before_m: Eyes, after_m: Eyes) -> float:
     `UNSHARED` times in addition.
     """
     if len(before_m) == 2:
-        return float(((after_m - before_m).mean(axis=0) ** 2).sum())
+        x, y, z = midpoints(after_m - before_m)[0].tolist()
+        return float(x * x + y * y + z * z)
     moved = midpoints(after_m) - midpoints(before_m)
     unshared = moved - common_movement_m(before_m, after_m)
     return float((moved**2 + UNSHARED * unshared**2).sum(axis=1).mean())

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -118,10 +117,10 @@ class Viewer:
             return eyes
         if rest is not None and rest.place is not None:
             label: EyesLabel = eyes.label if eyes.label == "held" else "rested"
-            return replace(eyes, eyes_m=rest.place, label=label, sigma_m=rest.sigma_m, people=numbers)
+            return EyesEstimate(eyes.time_ns, eyes.capture_ns, rest.place, label, rest.sigma_m, numbers)
         if float(eyes.eyes_m[:, 0].min()) <= self._nearest_m:
             return EyesEstimate(eyes.time_ns, eyes.capture_ns, None, "none")
-        return replace(eyes, people=numbers)
+        return EyesEstimate(eyes.time_ns, eyes.capture_ns, eyes.eyes_m, eyes.label, eyes.sigma_m, numbers)
 
 
 def together(estimates: Sequence[EyesEstimate]) -> EyesEstimate:

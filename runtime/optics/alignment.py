@@ -96,7 +96,8 @@ def align(stack: PanelStack, *, solved_for_m: Eyes, eyes_m: Eyes) -> Alignment:
 
 
 def _middle(eyes_m: Eyes) -> F64:
-    return np.asarray(midpoints(eyes_m).mean(axis=0))
+    middles = midpoints(eyes_m)
+    return np.asarray(middles.mean(axis=0)) if len(middles) > 1 else middles[0]
 
 
 def _as_they_are(stack: PanelStack) -> tuple[F64, ...]:

@@ -62,7 +62,7 @@ def parallax(stack: PanelStack, *, old_m: F64, new_m: F64) -> Parallax | None:
     places, weights = [], []
     for n in range(stack.count):
         raster = stack.panel(n)
-        places.append(raster.to(middle, new_m))
+        places.append(raster.to_from(middle, new))
         weights.append((old[0] - raster.x_m) / old_x_m * middle.pitch_u_m / raster.pitch_u_m)
     drift_px = (
         (k * new[1] - old[1] + growth * middle.left_m) / middle.pitch_u_m,
