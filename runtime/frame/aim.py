@@ -190,8 +190,7 @@ class Aim:
         if set(eyes.people) - set(shown.people) and len(eyes.people) > 1:
             return pictures.contrast  # somebody waits for a picture
         then_m, now_m = matched(shown, eyes)
-        alone = len(now_m) == 2
-        moved_m = float(np.linalg.norm((then_m - now_m).mean(axis=0))) if alone else moved_m2(then_m, now_m) ** 0.5
+        moved_m = moved_m2(then_m, now_m) ** 0.5
         return pictures.own(shown.effort) + pictures.stale(moved_m, (time_ns - shown.solved_for_ns) / NS_PER_S)
 
     def _refined(
