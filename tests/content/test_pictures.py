@@ -12,11 +12,11 @@ import pytest
 from runtime.config import ContentSettings
 from runtime.content.base import ContentSource
 from runtime.content.frames import Video
-from runtime.content.images import WarpedPicture, image_from_view, rgba_from_rgb
+from runtime.content.images import WarpedPicture, plane_from_pixels, rgba_from_rgb
 from runtime.content.pictures import PicturesSource
 from runtime.content.placing import SceneFile
 from runtime.errors import ContentFailure, InputError
-from runtime.optics.views import image_from_stack
+from runtime.optics.views import image_from_raster, image_from_stack
 from runtime.support.artifacts import write_png
 from tests.calls import refusal
 from tests.content.conftest import STACK, panel_view
@@ -221,8 +221,9 @@ def test_a_picture_much_larger_than_the_raster_is_averaged() -> None:
     lines = np.zeros((1080, 1920, 3), np.uint8)
     lines[:, ::2] = 255
     view = panel_view((0.7, -0.03, 0.1), STACK.panel(1))
+    plane = STACK.panel(1)
     projection = image_from_stack(view.eye_m, width_px=1920, height_px=1080, fov_deg=60)
-    matrix = image_from_view(projection, view.pixels_from_stack)
+    matrix = image_from_raster(projection, plane) @ plane_from_pixels(view.pixels_from_stack, plane)
     picture = WarpedPicture(rgba_from_rgb(lines), background=(1.0, 1.0, 1.0)).warped(matrix, view)
     inner = picture[60:-60, 60:-60, 0].astype(int)
     assert np.abs(inner - 128).max() < 32
