@@ -15,9 +15,7 @@
   const HEADSET_M = 2; // distance in the page that is shown at the display, for `immersive-vr`
   const FIRST_S = 10; // time limit for the display's first request
   const STALE_MS = 500; // frames are drawn at this interval if the display asks for none
-  const ENCODING_MAX = 2; // largest number of frames that are being encoded
   const HOPS = 50; // steps for which a page's asynchronous callback may wait, all in one task, before its picture is read
-  const UNSENT_MAX = 4e6; // largest number of bytes that wait to be sent
 
   // Settings, in order of precedence: the page's address (#phasestack=ws://...&comfort=1), `data-` attributes of this
   // script's element, and earlier entries. They can be changed while a session runs.
@@ -78,8 +76,6 @@
       if (!this.last) settings.problem ||= "phasestack asks for no pictures; does it show the scene `program`?";
       return this.last;
     }
-
-    get isBusy() { return this.socket.readyState !== WebSocket.OPEN || this.socket.bufferedAmount > UNSENT_MAX; }
 
     send(frame, eye, jpeg) {
       const head = new DataView(new ArrayBuffer(8));
@@ -309,10 +305,8 @@
     #callbacks = new Map();
     #count = 0;
     #pending = {};
-    #encoding = 0;
-    #waiting = null;
     #ended = false;
-    #canvases = [];
+    #canvas = document.createElement("canvas");
     constructor(isInline, features) {
       super();
       Object.assign(this, { isInline, enabledFeatures: features, inputSources: [], trackedSources: [], environmentBlendMode: "opaque", visibilityState: "visible",
@@ -370,11 +364,6 @@
     }
 
     async #draw(request) {
-      if (this.#encoding >= ENCODING_MAX || this.display.isBusy) {
-        this.#waiting = request;
-        return;
-      }
-      this.#waiting = null;
       const layer = await this.#frame(request);
       if (layer) this.#send(request, layer.read(request));
     }
@@ -406,21 +395,14 @@
       return this.#ended ? null : baseLayer;
     }
 
-    async #send(request, pictures) {
-      this.#encoding += 1;
-      const canvases = this.#canvases.pop() ?? [0, 1].map(() => new OffscreenCanvas(1, 1));
-      try {
-        await Promise.all(pictures.map(async (paint, n) => {
-          const canvas = Object.assign(canvases[n], { width: request.width, height: request.height });
-          paint(canvas.getContext("2d", { willReadFrequently: true }));
-          const jpeg = await canvas.convertToBlob({ type: "image/jpeg", quality: settings.quality });
-          this.display.send(request.frame, request.eyes[n].eye === "left" ? 0 : 1, jpeg);
-        }));
-      } finally {
-        this.#canvases.push(canvases);
-        this.#encoding -= 1;
-        if (this.#waiting) this.#draw(this.#waiting);
-      }
+    #send({ frame, width, height, eyes }, pictures) {
+      const canvas = Object.assign(this.#canvas, { width, height }), context = canvas.getContext("2d", { willReadFrequently: true });
+      pictures.forEach((paint, n) => {
+        paint(context);
+        // At once, because `convertToBlob` waits for an idle moment, for up to 1 s if the page is busy drawing.
+        const [, base64] = canvas.toDataURL("image/jpeg", settings.quality).split(",");
+        this.display.send(frame, eyes[n].eye === "left" ? 0 : 1, Uint8Array.fromBase64(base64));
+      });
     }
   }
 
