@@ -38,6 +38,17 @@ TESTS_OF = {
     "page": ("page", "browser"),
 }
 OUTPUT = "output.txt"
+RULES = """[run]
+source = phasestack,runtime,calib,model_export
+parallel = true
+data_file = {data}
+context = ${{PYTEST_CURRENT_TEST-}}
+"""
+STARTUP = """import os
+if "COVERAGE_PROCESS_START" in os.environ:
+    import coverage
+    coverage.process_startup()
+"""  # of each process that a test starts
 OPTIONS = ("-xq", "-m", "not slow", "-p", "no:cacheprovider", "-p", "no:xdist",
            "-W", "ignore::pytest.PytestAssertRewriteWarning")  # fmt: skip
 LIBRARIES = ("PIL.Image", "cv2", "hypothesis.extra.numpy", "pydantic", "scipy.optimize", "scipy.stats", "typer")
@@ -182,14 +193,17 @@ class Tree:
         room, _, part = self.room.partition("/")
         own = (f"{room}/test_{part}.py",) if (self.folder / f"tests/{room}/test_{part}.py").exists() else (room,)
         places = [f"tests/{name}" for name in TESTS_OF.get(room, own)]
-        seconds_file, told = self.folder / "seconds.json", ("--cov", "--cov-context=test", "--cov-report=")
-        if self._code_of_tests((*told, "--cov-fail-under=0", *places), Chosen(), None, seconds_file) != 0:
+        seconds_file, rules = self.folder / "seconds.json", self.folder / "coverage.ini"
+        rules.write_text(RULES.format(data=self.folder / ".coverage"))
+        (self.folder / "sitecustomize.py").write_text(STARTUP)
+        told = ("--cov", f"--cov-config={rules}", "--cov-context=test", "--cov-report=", *places)
+        if self._code_of_tests(told, Chosen(), None, seconds_file) != 0:
             raise SystemExit(f"{(self.folder / OUTPUT).read_text()}the tests of {self.room} fail without any change")
         data = CoverageData(str(self.folder / ".coverage"))
         data.read()
         by_line = {
             Path(file).relative_to(self.folder): {
-                line: {context.rpartition("|")[0] for context in contexts}
+                line: {re.sub(r"(\|run| \(call\)|.(setup|teardown)\)?)$", "", context) for context in contexts}
                 for line, contexts in data.contexts_by_lineno(file).items()
             }
             for file in data.measured_files()
@@ -242,7 +256,9 @@ def _run_tests(folder: Path, told: Sequence[str], plugin: Chosen, seconds_file: 
         for name in [name for name in sys.modules if name.partition(".")[0] in COPIED]:
             del sys.modules[name]
         os.environ["PYTHONPATH"] = str(folder)
-        if seconds_file is None:
+        if seconds_file is not None:
+            os.environ["COVERAGE_PROCESS_START"] = str(folder / "coverage.ini")
+        else:
             os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
             sys.dont_write_bytecode = True
         code = pytest.main([*OPTIONS, *told], plugins=[plugin])

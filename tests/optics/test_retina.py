@@ -65,6 +65,7 @@ def test_code_values_are_fractions_of_255_and_alpha_is_ignored(seed: int) -> Non
     values = codes[..., :3].astype(np.float32) / np.float32(255)
     eye = [0.7, 0.05, 0.1]
     from_codes, from_values = seen_by(eye, codes, stack, fov_deg=40), seen_by(eye, values, stack, fov_deg=40)
+    assert from_codes.image.shape == (20, 32, 3)
     np.testing.assert_allclose(from_codes.image, from_values.image, atol=2e-6)
     np.testing.assert_array_equal(from_codes.mask, from_values.mask)
 

@@ -16,7 +16,8 @@ def test_maker_model_and_serial_are_read() -> None:
     assert (edid.maker, edid.name, edid.serial) == ("EIZ", "CG2700X", "A1B2-0003")
 
 
-def test_numbers_that_mean_none_are_none() -> None:
+def test_a_serial_number_is_text_unless_it_means_none() -> None:
+    assert parse(block(serial_number=1234)).serial == "1234"
     assert parse(block(serial_number=0)).serial == ""
     assert parse(block(serial_number=0x01010101)).serial == ""
 
