@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tests.mutate import files_of, mutations_of
+from tests.mutate import Coverage, files_of, mutations_of
 
 SOURCE = '''"""Ünïcode before the places that are changed."""
 LIMIT: int | 3 = 4
@@ -34,6 +34,15 @@ def test_each_change_is_one_place_that_still_compiles() -> None:
     assert changed == {SOURCE.replace(old, new) for old, new in places}
     for text in changed:
         compile(text, "a.py", "exec")
+
+
+def test_a_change_meets_the_tests_of_its_line_or_on_import_of_its_file() -> None:
+    source, path = SOURCE.encode(), Path("a.py")
+    lines = {2: {""}, 8: {"", "a::log"}, 9: {"a::close"}}  # `return` is run by none
+    coverage = Coverage({"a::log": 1.0, "a::close": 1.0, "b::other": 1.0}, {path: lines})
+    changes = {mutation.text: coverage.tests_of(mutation, source) for mutation in mutations_of(path, source)}
+    assert changes[b"(8)"] == {"a::log", "a::close"} and changes[b"pass"] == {"a::close"}
+    assert changes[b"(False)"] == set()
 
 
 def test_kernels_are_changed_by_their_operators_outside_comments() -> None:
