@@ -36,7 +36,7 @@ def test_each_change_is_one_place_that_still_compiles() -> None:
         compile(text, "a.py", "exec")
 
 
-def test_a_change_meets_the_tests_of_its_line_or_on_import_of_its_file() -> None:
+def test_a_change_meets_the_tests_that_run_it() -> None:
     source, path = SOURCE.encode(), Path("a.py")
     lines = {2: {""}, 8: {"", "a::log"}, 9: {"a::close"}}  # `return` is run by none
     coverage = Coverage({"a::log": 1.0, "a::close": 1.0, "b::other": 1.0}, {path: lines})

@@ -12,6 +12,7 @@ from runtime.clock import NS_PER_S
 from runtime.config import ContentSettings
 from runtime.content.base import ContentInfo, ContentSource, View
 from runtime.content.playlist import PlaylistSource, read_playlist
+from runtime.errors import InputError
 from runtime.support.artifacts import write_png
 from tests.calls import refusal
 from tests.content.conftest import STACK, panel_view
@@ -158,11 +159,14 @@ def test_closing_a_playlist_closes_every_scene(inner: tuple[PlaylistSource, list
     assert [scene.closed for scene in scenes] == [1, 1, 1]
 
 
+def no_scene(context: Any) -> ContentSource:
+    raise InputError("green", "", "is no scene")
+
+
 def test_scenes_are_closed_if_a_later_one_cannot_be_shown(folder: Path) -> None:
     first, playlist = Inner("red"), read_playlist(written(folder, *THREE), ContentSettings())
-    with pytest.raises(ZeroDivisionError):
-        PlaylistSource(playlist, [lambda context: first, lambda context: 1 // 0], context=None)
-    assert first.closed == 1
+    told = refusal(PlaylistSource, playlist, [lambda context: first, no_scene], context=None)
+    assert told == f"{playlist.path}: show[1]: green: is no scene" and first.closed == 1
 
 
 def test_no_revision_comes_back_when_a_later_round_is_skipped_through(
