@@ -3,7 +3,8 @@
 # The argument `test` adds the packages for the tests, and `slow` also those for the slow tests.
 set -u
 runtime="g++ libegl1 libgl1-mesa-dri libgles2 libgl1 libusb-1.0-0 libopenni2-0"
-testing="xvfb xserver-xorg-core xserver-xorg-video-dummy x11-xserver-utils x11-apps imagemagick chromium systemd udev"
+testing="xvfb xserver-xorg-core xserver-xorg-video-dummy x11-xserver-utils x11-apps xdotool imagemagick chromium systemd udev"
+testing="$testing libxcb-composite0 libxcb-res0"
 slow="debootstrap systemd-container buildah e2fsprogs"  # tests of a booted system, of the image and of a power cut
 case ${1:-} in
   test) wanted="$runtime $testing" ;;

@@ -73,11 +73,13 @@ class Feed(ABC):
     def _run(self) -> None:
         """Read pictures and call `_take` for each, until `_ends` is set."""
 
-    def _take(self, rgb: U8, pixel_aspect: float = 1.0, pointer: tuple[float, float] | None = None) -> None:
+    def _take(
+        self, rgb: U8, pixel_aspect: float = 1.0, pointer: tuple[float, float] | None = None, problem: str = ""
+    ) -> None:
         self._count += 1
         self._seen_s = time.monotonic()
         self.newest = LivePicture(self._count, rgb, pixel_aspect, pointer)
-        self.problem = ""
+        self.problem = problem
 
     def state(self) -> str:
         """Return why no new pictures arrive, in one line, or an empty string."""

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import re
 import shutil
 import subprocess
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing, contextmanager, suppress
-from ctypes import POINTER, Structure, c_char_p, c_int, c_int16, c_uint, c_uint8, c_uint16, c_uint32, c_void_p
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any
@@ -23,6 +21,7 @@ from runtime.config import Section, validated
 from runtime.content.base import ContentSource
 from runtime.content.live import Feed, LiveSource, end_group
 from runtime.content.placing import SceneFile
+from runtime.content.x_server import Pointer, XConnection
 from runtime.errors import InputError, one_line
 from runtime.records import U8
 
@@ -32,7 +31,6 @@ CLICK_S = 0.02  # how often the mouse button is looked at while the user chooses
 LOOKED_UP_WITHIN_S = 3.0  # time limit for the list of windows, and for a virtual screen's start
 OURS = "phasestack"  # class and title of our own panels
 BUTTON = 1 << 8  # bit of the first mouse button
-AUTOMATIC = 0  # a redirected window is still shown
 INNER = 0.4  # a titled child window that fills this share of its parent is shown instead of it
 WINDOW = re.compile(  # a line of `xwininfo -root -tree`
     r'^(?P<indent>\s*)(?P<id>0x[0-9a-f]+) (?P<name>".*"|\(has no name\)): \((?P<kind>.*)\)\s+(?P<w>\d+)x(?P<h>\d+)\S+'
@@ -184,7 +182,7 @@ class WindowFeed(Feed):
                     raise ValueError(f"the X server {display} has ended")
                 is_down = bool(now.buttons & BUTTON)
                 if is_down and not was_down and now.child:
-                    return int(now.child)
+                    return now.child
                 was_down = is_down
         raise ValueError("no window was chosen")
 
@@ -200,16 +198,19 @@ class WindowFeed(Feed):
                 source = f"{display}+{place.x},{place.y}"
         looked_s, last, last_pointer = time.monotonic(), np.empty((0, 0, 3), np.uint8), None
         with ExitStack() as stack:
-            mouse = stack.enter_context(closing(XConnection(display)))
-            if place is not None and place.window:
-                mouse.keep_covered(place.window)
+            server = stack.enter_context(closing(XConnection(display)))
+            window = place.window if place is not None else 0
+            if window:
+                server.keep_covered(window)
             container = stack.enter_context(av.open(source, format="x11grab", options=given))
             for frame in container.decode(video=0):
                 rgb: U8 = np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
                 self._seen_s = time.monotonic()
-                pointer = pointer_in(mouse.now(), place, rgb.shape[:2]) if self._options.pointer else None
-                if self.problem or pointer != last_pointer or not np.array_equal(rgb, last):
-                    self._take(rgb, pointer=pointer)
+                pointer = pointer_in(server.now(), place, rgb.shape[:2]) if self._options.pointer else None
+                is_program = window or process is not None
+                problem = f"{self.name}: the program does not respond" if is_program and server.hangs(window) else ""
+                if problem != self.problem or pointer != last_pointer or not np.array_equal(rgb, last):
+                    self._take(rgb, pointer=pointer, problem=problem)
                     last, last_pointer = rgb, pointer
                 if self._ends.is_set() or (process is not None and process.poll() is not None):
                     return
@@ -250,85 +251,10 @@ class WindowFeed(Feed):
                     end_group(one)
 
 
-def pointer_in(now: Pointed | None, place: Place | None, size_px: tuple[int, ...]) -> tuple[float, float] | None:
+def pointer_in(now: Pointer | None, place: Place | None, size_px: tuple[int, ...]) -> tuple[float, float] | None:
     """Return a pointer's place as fractions of a picture's width and height, or None if it is outside."""
     if now is None:
         return None
     left, top = (0, 0) if place is None else (place.x, place.y)
     u, v = (now.x - left + 0.5) / size_px[1], (now.y - top + 0.5) / size_px[0]
     return (u, v) if 0 <= u < 1 and 0 <= v < 1 else None
-
-
-# libxcb is used, because libX11 ends the process if the X server ends.
-
-
-class _Screens(Structure):
-    _fields_ = (("data", POINTER(c_uint32)), ("rem", c_int), ("index", c_int))  # a screen begins with its root window
-
-
-class _Cookie(Structure):
-    _fields_ = (("sequence", c_uint),)
-
-
-class Pointed(Structure):
-    """Place of the pointer, in pixels from the screen's top left corner."""
-
-    _fields_ = (
-        ("response", c_uint8), ("same_screen", c_uint8), ("sequence", c_uint16), ("length", c_uint32),
-        ("root", c_uint32),
-        ("child", c_uint32),  # number of the top-level window under the pointer, or 0
-        ("x", c_int16), ("y", c_int16), ("window_x", c_int16), ("window_y", c_int16),
-        ("buttons", c_uint16),  # pressed buttons and keys, such as `BUTTON`
-    )  # fmt: skip
-
-
-class XConnection:
-    """Connection to an X server that reads its pointer, and keeps covered windows."""
-
-    def __init__(self, display: str) -> None:
-        """Connect. Raises OSError if libxcb is missing or the server cannot be reached."""
-        self._xcb, self._free = ctypes.CDLL("libxcb.so.1"), ctypes.CDLL(None).free
-        self._free.argtypes = [c_void_p]
-        for name, result, *given in (
-            ("xcb_connect", c_void_p, c_char_p, c_void_p),
-            ("xcb_connection_has_error", c_int, c_void_p),
-            ("xcb_disconnect", None, c_void_p),
-            ("xcb_get_setup", c_void_p, c_void_p),
-            ("xcb_setup_roots_iterator", _Screens, c_void_p),
-            ("xcb_query_pointer", _Cookie, c_void_p, c_uint32),
-            ("xcb_query_pointer_reply", POINTER(Pointed), c_void_p, _Cookie, c_void_p),
-        ):
-            function: Any = getattr(self._xcb, name)
-            function.restype, function.argtypes = result, given
-        self._connection: Any = self._xcb.xcb_connect(display.encode(), None)
-        if self._xcb.xcb_connection_has_error(self._connection):
-            self.close()
-            raise OSError(f"the X server {display} cannot be used")
-        setup = self._xcb.xcb_get_setup(self._connection)
-        self._root: int = self._xcb.xcb_setup_roots_iterator(setup).data[0]
-
-    def now(self) -> Pointed | None:
-        """Return the pointer's place, or None if it is on another screen or the connection is lost."""
-        cookie = self._xcb.xcb_query_pointer(self._connection, self._root)
-        reply = self._xcb.xcb_query_pointer_reply(self._connection, cookie, None)
-        if not reply:
-            return None
-        found = Pointed.from_buffer_copy(reply.contents)
-        self._free(reply)
-        return found if found.same_screen else None
-
-    def keep_covered(self, window: int) -> None:
-        """Have the server keep a window's picture where others cover it, until `close`. Has no effect without
-        libxcb-composite.
-        """
-        with suppress(OSError):
-            redirect = ctypes.CDLL("libxcb-composite.so.0").xcb_composite_redirect_window
-            redirect.restype, redirect.argtypes = _Cookie, [c_void_p, c_uint32, c_uint8]
-            redirect(self._connection, window, AUTOMATIC)
-            self.now()  # waits until the server has done so
-
-    def close(self) -> None:
-        """Close the connection. Has no effect if it is closed."""
-        if self._connection is not None:
-            self._xcb.xcb_disconnect(self._connection)
-            self._connection = None

@@ -36,6 +36,11 @@ SHOWS_HALVES = (  # a window whose left half has one colour and whose right half
     "    tkinter.Frame(root, bg=colour).place(relx=n / 2, rely=0, relwidth=0.5, relheight=1)\n"
     "root.mainloop()"
 )
+HANGS = (  # a window whose program does nothing from SIGUSR1 to SIGUSR2
+    "import glfw, signal; signal.signal(signal.SIGUSR1, lambda *_: signal.sigwait({signal.SIGUSR2})); glfw.init()\n"
+    "signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGUSR2}); glfw.window_hint(glfw.CLIENT_API, glfw.NO_API)\n"
+    "glfw.create_window(160, 90, 'stereo', None, None)\nwhile True: glfw.wait_events_timeout(0.1)"
+)
 LISTED = """
 xwininfo: Window id: 0x50e (the root window) (has no name)
 
@@ -71,8 +76,10 @@ def display() -> Iterator[str]:
         server.kill()
 
 
-def window(display: str, title: str, geometry: str, *colours: str) -> subprocess.Popen[bytes]:
-    command = [sys.executable, "-c", SHOWS_HALVES, title, geometry, *colours]
+def window(
+    display: str, title: str, geometry: str, *colours: str, script: str = SHOWS_HALVES
+) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-c", script, title, geometry, *colours]
     return subprocess.Popen(command, env=os.environ | {"DISPLAY": display})
 
 
@@ -210,6 +217,33 @@ def test_a_hidden_window_is_told_and_comes_back(display: str) -> None:
     in_window(display, "stereo", "windowunmap")
     assert eventually(lambda: "stereo: is hidden" in source.problem)
     in_window(display, "stereo", "windowmap")
+    assert eventually(lambda: source.problem == "")
+    shown.kill()
+    shown.wait()
+    source.close()
+
+
+needs_processes = pytest.mark.skipif(find_library("xcb-res") is None, reason="needs libxcb-res")
+
+
+@needs_x
+@pytest.mark.parametrize(
+    ("script", "right", "hang", "go_on"),
+    [
+        pytest.param(SHOWS_HALVES, (0, 0, 255), signal.SIGSTOP, signal.SIGCONT, marks=needs_processes),
+        (HANGS, (0, 0, 0), signal.SIGUSR1, signal.SIGUSR2),
+    ],
+)
+def test_a_program_that_hangs_is_told_and_keeps_its_picture(
+    display: str, script: str, right: tuple[int, ...], hang: signal.Signals, go_on: signal.Signals
+) -> None:
+    shown = window(display, "stereo", "160x90+0+0", "#000000", "#0000ff", script=script)
+    source = opened(title="stereo", display=display)
+    assert eventually(lambda: shows(source, (0, 0, 0), right) and source.problem == "")
+    shown.send_signal(hang)
+    assert eventually(lambda: source.problem == "stereo: the program does not respond")
+    assert shows(source, (0, 0, 0), right)
+    shown.send_signal(go_on)
     assert eventually(lambda: source.problem == "")
     shown.kill()
     shown.wait()
