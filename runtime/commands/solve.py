@@ -83,6 +83,7 @@ def solve(
             asked,
             out,
             watch,
+            is_resampled=camera is not None,
             model=model,
             repeat=repeat,
             eye_sigma_mm=eye_sigma_mm,

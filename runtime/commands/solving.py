@@ -27,7 +27,7 @@ from runtime.optics.disparity import disparity_doubts
 from runtime.optics.stack import PanelStack
 from runtime.plan.savings import Measured, network_items
 from runtime.records import F64
-from runtime.report.pairs import read_case
+from runtime.report.pairs import StillPair, read_case
 from runtime.support.artifacts import OutputFolder, write_json
 from runtime.support.gl import offscreen_context
 from runtime.support.picture_file import read_image
@@ -47,19 +47,7 @@ class Eyes:
     cameras: Path | None  # file that contains the cameras' matrices
 
 
-@dataclass(frozen=True, slots=True)
-class Asked:
-    """Validated pictures to solve, as seen by eyes that look at the stack's origin."""
-
-    name: str  # of the files
-    pictures: list[Any]  # each eye's picture, (h, w, 3 or 4) uint8
-    stack: PanelStack
-    eyes_m: F64  # (V, 3) frame `stack`
-    fov_deg: float
-    is_resampled: bool = False  # True if the pictures were taken by other cameras
-
-
-def asked_for(left: Path | None, right: Path | None, layout: str | None, eyes: Eyes, panels: Path | None) -> Asked:
+def asked_for(left: Path | None, right: Path | None, layout: str | None, eyes: Eyes, panels: Path | None) -> StillPair:
     """Read a stereo pair, from two files or one with a `layout`, and the panels. Raises InputError."""
     if left is None:
         raise InputError("solve", "--left", "is required without --case; pass the left eye's picture")
@@ -77,22 +65,22 @@ def asked_for(left: Path | None, right: Path | None, layout: str | None, eyes: E
             raise InputError(right, "size", f"the pictures must have the same size, but are {sizes}")
     stack = load_stack(panels, width_px=pictures[0].shape[1], height_px=pictures[0].shape[0])
     pictures, eyes_m, fov_deg = taken(pictures, eyes, stack)
-    return Asked(name, pictures, stack, eyes_m, fov_deg, eyes.cameras is not None)
+    return StillPair(name, stack, eyes_m, tuple(pictures), fov_deg)
 
 
-def case_asked_for(case: Path, others: list[str]) -> Asked:
+def case_asked_for(case: Path, others: list[str]) -> StillPair:
     """Read a case file. Raises InputError if it is invalid, or with `others`, options that it replaces."""
     if others:
         raise InputError("solve", others[0], "is part of the case file; omit it, or omit --case")
-    pair = read_case(case)
-    return Asked(case.name, list(pair.images), pair.stack, pair.eyes_m, pair.fov_deg)
+    return read_case(case)
 
 
 def solve_pictures(
-    asked: Asked,
+    asked: StillPair,
     out: Path,
     watch: Stopwatch,
     *,
+    is_resampled: bool,
     model: str,
     repeat: int,
     eye_sigma_mm: float,
@@ -100,10 +88,11 @@ def solve_pictures(
     plan: bool,
     floats: bool,
 ) -> dict[str, Any]:
-    """Solve pictures, write the layers and the eyes' views, and return the contents of solve.json. Raises
-    InputError if an option or the given eye positions cannot be used.
+    """Solve pictures, write the layers and the eyes' views, and return the contents of solve.json.
+    `is_resampled`: they were taken by cameras that are not aimed at the origin. Raises InputError if an option or the
+    given eye positions cannot be used.
     """
-    pictures, stack, eyes_m, fov_deg = asked.pictures, asked.stack, asked.eyes_m, asked.fov_deg
+    pictures, stack, eyes_m, fov_deg = asked.images, asked.stack, asked.eyes_m, asked.fov_deg
     settings = with_options(Settings(), model=model, backend=backend).model
     cv2.setNumThreads(settings.threads)
     for line in doubts(eyes_m, stack, fov_deg=fov_deg, size=(pictures[0].shape[1], pictures[0].shape[0])):
@@ -153,7 +142,7 @@ def solve_pictures(
                 raise InputError("solve", "--left-eye", why) from None
             notes = []
             if len(pictures) == 2:
-                notes = disparity_doubts(pictures, eyes_m, stack, fov_deg=fov_deg, parallel=not asked.is_resampled)
+                notes = disparity_doubts(pictures, eyes_m, stack, fov_deg=fov_deg, parallel=not is_resampled)
             for note in notes:
                 typer.echo(f"phasestack: {note}", err=True)
             line = f"{asked.name}, model {predictor.name_with(len(pictures))}, solved for a tracking error of "

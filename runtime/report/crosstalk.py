@@ -24,7 +24,7 @@ from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack
 from runtime.records import F64, U8, Eyes
 from runtime.report.pairs import PairPainter, StillPair, eyes_at
-from runtime.report.tolerance import solved
+from runtime.report.tolerance import falls_at, solved
 
 WIDTH_PX = 960  # crosstalk is measured on panels with at most this many columns
 PATCHES_MM = (2.0, 4.0, 6.0, 10.0, 20.0, 40.0, 80.0)
@@ -166,16 +166,9 @@ def freedom_without_tracking(pair: StillPair, layers: U8) -> dict[str, Any]:
     for name, axis in (("to the right", (0, 1, 0)), ("up", (0, 0, 1)), ("away", (1, 0, 0))):
         moves = (0.0, *MOVES_MM)
         lights = [light([mm / 1e3 * part for part in axis]) for mm in moves]
-        result[name] = {"mm": moves, "light_db": lights, "falls_3_db_at_mm": _crossing(moves, lights)}
+        costs = [lights[0] - light_db for light_db in lights]
+        result[name] = {"mm": moves, "light_db": lights, "falls_3_db_at_mm": falls_at(moves, costs, FALL_DB)}
     return result
-
-
-def _crossing(moves: Sequence[float], lights: Sequence[float]) -> float | None:
-    for n in range(1, len(moves)):
-        if lights[0] - lights[n] >= FALL_DB:
-            share = (lights[0] - FALL_DB - lights[n - 1]) / (lights[n] - lights[n - 1])
-            return float(moves[n - 1] + share * (moves[n] - moves[n - 1]))
-    return None
 
 
 PLACES = ((0.4, 0.0), (0.6, 0.0), (0.9, 0.0), (1.2, 0.0), (0.6, 20.0), (0.6, 40.0))  # distance in m, angle in degrees

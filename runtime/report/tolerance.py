@@ -95,13 +95,16 @@ class Cost:
         """Return the size that costs 1 dB, interpolated, or None if no size does or it is a choice."""
         if not self.imperfection.unit:
             return None
-        costs = [ideal_db - db for db in self.light_db]
-        for n in range(1, len(costs)):
-            if costs[n] >= 1.0:
-                low, high = self.imperfection.sizes[n - 1 : n + 1]
-                share = (1.0 - costs[n - 1]) / (costs[n] - costs[n - 1])
-                return float(low + (high - low) * min(max(share, 0.0), 1.0))
-        return None
+        return falls_at(self.imperfection.sizes, [ideal_db - db for db in self.light_db], 1.0)
+
+
+def falls_at(sizes: Sequence[float], costs_db: Sequence[float], by_db: float) -> float | None:
+    """Return the first size that costs `by_db`, interpolated, or None if no measured size does."""
+    for n in range(1, len(costs_db)):
+        if costs_db[n] >= by_db:
+            share = (by_db - costs_db[n - 1]) / (costs_db[n] - costs_db[n - 1])
+            return float(sizes[n - 1] + (sizes[n] - sizes[n - 1]) * min(max(share, 0.0), 1.0))
+    return None
 
 
 def solved(pair: StillPair, model: str = "balanced") -> Subject:
