@@ -31,6 +31,7 @@
     address: given.address ?? stored() ?? "",
     comfort_deg: Number(given.comfort ?? 1), // largest difference in vergence between far content and the display
     distance_m: Number(given.distance ?? 0), // distance in the page that is shown at the display; 0: 2 m, or 1:1 if inline
+    back_m: Number(given.back ?? 0), // how far the viewer stands behind the page's origin
     scale: Number(given.scale ?? 1), // of the pictures, 0.1 to 1
     quality: Number(given.quality ?? 0.95), // of JPEG
     problem: "", // reason for a missing picture
@@ -338,7 +339,8 @@
     }
 
     async requestReferenceSpace(type) {
-      const places = { viewer: () => this.viewer, local: () => new DOMMatrix(), unbounded: () => new DOMMatrix(), "local-floor": () => translated(0, -FLOOR_M, 0) };
+      const local = () => translated(0, 0, -settings.back_m);
+      const places = { viewer: () => this.viewer, local, unbounded: local, "local-floor": () => translated(0, -FLOOR_M, -settings.back_m) };
       if (!(type in places)) throw new DOMException(`the reference space ${type} is not supported`, "NotSupportedError");
       return new ReferenceSpace(places[type]);
     }

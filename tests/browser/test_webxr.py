@@ -85,13 +85,12 @@ def patiently(source: Any, head_m: tuple[float, float, float]) -> list[tuple[Any
     return found
 
 
-def places_px(view: Any, *, distance_m: float, comfort_deg: float) -> np.ndarray:
+def places_px(view: Any, *, distance_m: float, comfort_deg: float, back_m: float = 0.0) -> np.ndarray:
     """Where the squares are seen, with distances that the comfort limits.
 
     Along each ray of the resting eye, 1/distance is k/distance before, plus that of the farthest comfortable point.
     """
-    before = POINTS * VIEWER_M / 2
-    before = before * (2 / distance_m)  # metres, from the resting eye
+    before = (POINTS - [0, 0, back_m]) * VIEWER_M / distance_m  # metres, from the resting eye
     rear = max(1 / VIEWER_M - np.radians(comfort_deg) / IPD_M, 0)
     k = 1 - rear * VIEWER_M
     after = before / (k + rear * -before[:, 2:])
@@ -131,12 +130,12 @@ def test_squares_are_where_the_geometry_puts_them(
         assert told(browser) == "" and "token" not in told(browser)
 
 
-def test_settings_of_the_address_set_distance_and_comfort(source: Any, tmp_path: Path) -> None:
-    address = f"{source.program['address']}&comfort=20&distance=1.5"
+def test_settings_of_the_address_set_distance_comfort_and_place(source: Any, tmp_path: Path) -> None:
+    address = f"{source.program['address']}&comfort=20&distance=1.5&back=0.25"
     with browsing(tmp_path, "mode=immersive-vr", address):
         for head_m in EYES_M:
             for view, picture in patiently(source, head_m):
-                expected = places_px(view, distance_m=1.5, comfort_deg=20)
+                expected = places_px(view, distance_m=1.5, comfort_deg=20, back_m=0.25)
                 inside = ((expected > 10) & (expected < np.array([470, 260]))).all(1)
                 assert inside.sum() > 1
                 np.testing.assert_allclose(squares_px(picture, expected)[inside], expected[inside], atol=0.2)
