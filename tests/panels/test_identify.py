@@ -18,7 +18,7 @@ from runtime.commands.doctor import doctor, monitors
 from runtime.commands.identify import identify
 from runtime.config import load_settings
 from runtime.errors import InputError
-from runtime.panels.card import BARS
+from runtime.panels.card import BARS, identity_card
 from runtime.panels.geometry import mounting_of, panel_from_screen
 from tests.calls import invoked
 from tests.panels.edids import block
@@ -176,3 +176,26 @@ def test_the_doctor_refuses_monitors_that_are_mirrored_on_each_other(x: XServer,
     finally:
         x.place(0, 1, 2)
     assert failure.startswith("panels 1 and 2 would show the same pixels")
+
+
+def test_a_card_has_edges_bars_steps_an_arrow_and_text_in_its_room() -> None:
+    card = identity_card(1600, 900, title="0", lines=["long " * 40, "1"])
+    assert card.shape == (900, 1600, 4) and (card[..., 3] == 255).all()
+    ink = card[..., :3].min(-1) > 130
+    assert ink[[0, -1]].all() and ink[:, [0, -1]].all()
+    assert (card[[27, -28], 27:-27, :3] == (120, 130, 150)).all() and (card[27:-27, [27, -28], 0] == 120).all()
+    bars = card[700, [1600 * (2 * n + 1) // 14 for n in range(7)], :3]
+    assert list(map(tuple, bars.tolist())) == list(BARS)
+    assert card[850, 50::100, 0].tolist() == [17 * step for step in range(16)]
+    for region, expected in {  # rows and columns, and those of the ink
+        (30, 240, 30, 1100): (108, 234, 203, 296),  # title
+        (262, 347, 30, 1130): (331, 338, 192, 1088),  # a long line fills its room
+        (350, 600, 30, 1100): (369, 414, 203, 217),  # the next line
+        (30, 585, 1130, 1275): (117, 572, 1158, 1275),  # arrow
+        (232, 400, 1284, 1500): (288, 342, 1288, 1386),  # UP
+        (594, 675, 1130, 1500): (603, 639, 1162, 1365),  # RIGHT
+    }.items():
+        top, bottom, left, right = region
+        rows, columns = (np.flatnonzero(ink[top:bottom, left:right].any(axis)) for axis in (1, 0))
+        found = [top + rows[0], top + rows[-1], left + columns[0], left + columns[-1]]
+        assert found == pytest.approx(expected, abs=11), region
