@@ -15,12 +15,11 @@ import json
 import os
 import random
 import re
+import resource
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,7 +51,7 @@ if "COVERAGE_PROCESS_START" in os.environ:
 OPTIONS = ("-xq", "-m", "not slow", "-p", "no:cacheprovider", "-p", "no:xdist",
            "-W", "ignore::pytest.PytestAssertRewriteWarning")  # fmt: skip
 LIBRARIES = ("PIL.Image", "cv2", "hypothesis.extra.numpy", "pydantic", "scipy.optimize", "scipy.stats", "typer")
-LONGEST = 5.0  # tests that take this many times longer than without a change have noticed it
+LONGEST = 5.0  # tests that need this many times their former seconds of processor time have noticed the change
 SWAPPED: dict[type[ast.AST], type[ast.AST]] = {
     ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
     ast.And: ast.Or, ast.Or: ast.And, ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult,
@@ -197,7 +196,7 @@ class Tree:
         rules.write_text(RULES.format(data=self.folder / ".coverage"))
         (self.folder / "sitecustomize.py").write_text(STARTUP)
         told = ("--cov", f"--cov-config={rules}", "--cov-context=test", "--cov-report=", *places)
-        if self._code_of_tests(told, Chosen(), None, seconds_file) != 0:
+        if self._code_of_tests(told, Chosen(), resource.RLIM_INFINITY, seconds_file) != 0:
             raise SystemExit(f"{(self.folder / OUTPUT).read_text()}the tests of {self.room} fail without any change")
         data = CoverageData(str(self.folder / ".coverage"))
         data.read()
@@ -210,8 +209,8 @@ class Tree:
         }
         return Coverage(json.loads(seconds_file.read_text()), by_line)
 
-    def survives(self, mutation: Mutation, seconds: dict[str, float]) -> bool:
-        """Return True if tests pass in spite of a mutation. A kernel that is not compiled has been noticed."""
+    def outcome(self, mutation: Mutation, seconds: dict[str, float]) -> str:
+        """Return whether tests pass in spite of a mutation, and which test has noticed it."""
         path = self.folder / mutation.path
         source = path.read_bytes()
         path.write_bytes(mutation.applied(source))
@@ -219,35 +218,35 @@ class Tree:
             if path.suffix != ".py":
                 built = subprocess.run([sys.executable, *BUILD], cwd=self.folder, capture_output=True, check=False)
                 if built.returncode:
-                    return False
+                    return "noticed by the compiler"
             places = sorted({test.partition("::")[0] for test in seconds})
             code = self._code_of_tests(places, Chosen(seconds), LONGEST * sum(seconds.values()) + 30) if places else 0
-            return code in (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED)
+            if code in (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED):
+                return f"SURVIVED {len(seconds)} tests"
+            failed = re.search(r"^(?:FAILED|ERROR) (\S+)", (self.folder / OUTPUT).read_text(), re.MULTILINE)
+            return f"noticed by {failed[1] if failed else f'the end of the process ({code})'}"
         finally:
             path.write_bytes(source)
 
     def _code_of_tests(
-        self, told: Sequence[str], plugin: Chosen, timeout_s: float | None, seconds_file: Path | None = None
-    ) -> int | None:
-        """Run pytest in a fork, which has the libraries already, and return its exit code; none after the timeout."""
+        self, told: Sequence[str], plugin: Chosen, limit_s: float, seconds_file: Path | None = None
+    ) -> int:
+        """Run pytest in a fork, which has the libraries already, and return its exit code."""
         child = os.fork()
         if not child:
-            _run_tests(self.folder, told, plugin, seconds_file)
-        end = time.monotonic() + (timeout_s or float("inf"))
-        while time.monotonic() < end:
-            done, status = os.waitpid(child, os.WNOHANG)
-            if done:
-                return os.waitstatus_to_exitcode(status)
-            time.sleep(0.02)
-        os.kill(child, signal.SIGKILL)
-        os.waitpid(child, 0)
-        return None
+            _run_tests(self.folder, told, plugin, limit_s, seconds_file)
+        return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
-def _run_tests(folder: Path, told: Sequence[str], plugin: Chosen, seconds_file: Path | None) -> NoReturn:
-    """Run pytest in this process, and end it. Bytecode of a mutation is not kept: it would outlive the mutation."""
+def _run_tests(
+    folder: Path, told: Sequence[str], plugin: Chosen, limit_s: float, seconds_file: Path | None
+) -> NoReturn:
+    """Run pytest in this process, and end it. The limit is of processor time, which a busy machine does not lengthen;
+    a test that waits for ever has pytest's timeout. Bytecode of a mutation is not kept: it would outlive the mutation.
+    """
     code = 1
     try:
+        resource.setrlimit(resource.RLIMIT_CPU, (int(limit_s), int(limit_s)))
         output = os.open(folder / OUTPUT, os.O_RDWR | os.O_CREAT | os.O_TRUNC)
         for standard in (0, 1, 2):
             os.dup2(output, standard)
@@ -298,10 +297,9 @@ def main() -> int:
         for number, mutation in enumerate(chosen, 1):
             source = files[mutation.path]
             tests = coverage.tests_of(mutation, source)
-            survived = tree.survives(mutation, {test: coverage.seconds[test] for test in tests})
-            survivors += survived
-            outcome = f"SURVIVED {len(tests)} tests of" if survived else "noticed"
-            print(f"{number}/{len(chosen)} {outcome} {mutation.describe(source)}", flush=True)
+            outcome = tree.outcome(mutation, {test: coverage.seconds[test] for test in tests})
+            survivors += outcome.startswith("SURVIVED")
+            print(f"{number}/{len(chosen)} {mutation.describe(source)}: {outcome}", flush=True)
     share = 1 - survivors / max(len(chosen), 1)
     print(f"{told.room}: {len(chosen) - survivors} of {len(chosen)} mutations noticed ({share:.0%})")
     return int(share < told.at_least)
