@@ -178,7 +178,7 @@ def test_the_doctor_refuses_monitors_that_are_mirrored_on_each_other(x: XServer,
     assert failure.startswith("panels 1 and 2 would show the same pixels")
 
 
-def test_a_card_has_edges_bars_steps_an_arrow_and_text_in_its_room() -> None:
+def test_a_card_has_edges_bars_steps_an_arrow_and_text() -> None:
     card = identity_card(1600, 900, title="0", lines=["long " * 40, "1"])
     assert card.shape == (900, 1600, 4) and (card[..., 3] == 255).all()
     ink = card[..., :3].min(-1) > 130
