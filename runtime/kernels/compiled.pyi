@@ -74,7 +74,7 @@ class Problem:
         """Do one of `parts` parts of a step."""
 
 class Source:
-    """A copy of an (h, w[, 3]) image whose values are limited to +-8191, to be resampled."""
+    """A copy of an (h, w[, 3]) image whose values are limited to +-8160, to be resampled."""
 
     def __init__(self, image: NDArray[int16]) -> None: ...
     def warp(

@@ -6,7 +6,7 @@
 #include "sampling.hpp"
 
 constexpr double BEYOND = 1e-9;     // minimum argument for the logarithm; no column corresponds to smaller arguments
-constexpr int16_t LARGEST = 8191;   // largest absolute value that can be sampled
+constexpr int16_t LARGEST = 8160;   // largest absolute value that can be sampled; rounded mixtures must stay within 8191
 
 struct Columns {  // for column u, the homography applies to t = middle + (1 - exp(-bend (u - middle))) / bend
   double bend, middle;

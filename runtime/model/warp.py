@@ -85,7 +85,7 @@ def warp(
     result_columns: ColumnLaw = EVEN_COLUMNS,
     threads: int | None = None,
 ) -> I16:
-    """Resample an (h, w[, 3]) int16 image, clipped to ±8191, several times as fast as `resample`.
+    """Resample an (h, w[, 3]) int16 image, clipped to ±8160, several times as fast as `resample`.
 
     The 3x3 homography maps columns, as the coordinates t of the column laws, of which one must be even, and rows of the
     result, `size` (rows, columns), to the image's. Edges are repeated outwards for `reach_px`, at most `REACH_PX`;

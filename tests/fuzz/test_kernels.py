@@ -27,6 +27,7 @@ from runtime.records import F64, U8
 FIRST = int(os.environ.get("FUZZ_FIRST", "0"))
 EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", "40"))
 BATCH = 20  # geometries in a test
+FOUND = [5005560, 69002240, 69003960]  # first numbers of tests that have failed: rounded mixtures were out of range
 SIZES = [
     (1, 7),
     (7, 1),
@@ -136,7 +137,7 @@ def test_any_geometry_is_solved_or_refused(first: int) -> None:
     assert done >= BATCH // 4
 
 
-@pytest.mark.parametrize("first", range(FIRST, FIRST + EXAMPLES, BATCH))
+@pytest.mark.parametrize("first", [*FOUND, *range(FIRST, FIRST + EXAMPLES, BATCH)])
 def test_any_homography_is_sampled_or_refused(first: int) -> None:
     for seed in range(first, first + BATCH):
         rng = np.random.default_rng(seed)
