@@ -14,6 +14,7 @@
   const IPD_M = 0.063; // distance between the eyes, if only one is known
   const HEADSET_M = 2; // distance in the page that is shown at the display, for `immersive-vr`
   const FIRST_S = 10; // time limit for the display's first request
+  const LATE_MS = 400; // the display drops later pictures
   const STALE_MS = 500; // frames are drawn at this interval if the display asks for none
   const HOPS = 50; // steps for which a page's asynchronous callback may wait, all in one task, before its picture is read
 
@@ -366,8 +367,11 @@
     }
 
     async #draw(request) {
-      const layer = await this.#frame(request);
-      if (layer) this.#send(request, layer.read(request));
+      const asked_ms = performance.now(), layer = await this.#frame(request);
+      if (!layer) return;
+      this.#send(request, layer.read(request));
+      const taken_ms = performance.now() - asked_ms;
+      if (taken_ms > LATE_MS) settings.problem = `the page took ${taken_ms.toFixed()} ms to draw, but has ${LATE_MS} ms; a smaller \`scale\` helps`;
     }
 
     /** Lets the page draw. Returns the layer, or nothing if it has none yet. */
