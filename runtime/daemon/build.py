@@ -218,6 +218,7 @@ def build_run(
         simulated=simulated,
         newest=options.browser is not None,
     )
+    cleanup.callback(observer.close)
     pacer = Pacer(
         period_ns=panels.period_ns or round(NS_PER_S / settings.loop.rate_hz),
         photon_ns=round(settings.loop.scanout_ms * NS_PER_MS),

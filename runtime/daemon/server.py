@@ -28,7 +28,7 @@ from runtime.daemon.socket_file import BACKLOG, SocketInUse, listening_socket
 from runtime.errors import InputError, one_line, without_secrets
 from runtime.records import State
 from runtime.support.artifacts import to_json
-from runtime.support.background import BACKGROUND_NICENESS, begin, patience_s, set_niceness
+from runtime.support.background import begin, patience_s
 
 log = logging.getLogger("phasestack.service")
 
@@ -113,7 +113,6 @@ class StatusServer:
     # All methods below run on the server's thread.
 
     def _run(self) -> None:
-        set_niceness(BACKGROUND_NICENESS)
         self._loop.run_forever()
         self._loop.run_until_complete(self._end())
         self._loop.close()

@@ -17,7 +17,6 @@ from runtime.evaluation.displayed import eye_names
 from runtime.evaluation.refresh_quality import Pictures
 from runtime.records import U8
 from runtime.support.artifacts import OutputFolder, to_json, write_json, write_png, write_text
-from runtime.support.background import MEASURING_NICENESS, set_niceness
 from runtime.support.threads import parallel_map
 
 log = logging.getLogger("phasestack.output")
@@ -164,7 +163,6 @@ class RunOutput:
 
     def _write(self) -> None:
         """Run queued jobs in order on the writing thread, until a queue item is None."""
-        set_niceness(MEASURING_NICENESS)
         while (queued := self._work.get()) is not None:
             work, then = queued
             if not self.problem:

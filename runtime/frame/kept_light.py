@@ -18,7 +18,7 @@ from runtime.frame.truth import TrueEyes
 from runtime.optics.presentation import shown_layers
 from runtime.records import F64, U8, RefreshAccount
 from runtime.support import progress
-from runtime.support.background import MEASURING_NICENESS, BackgroundJob
+from runtime.support.background import BackgroundJob
 
 log = logging.getLogger("phasestack.light")
 
@@ -69,7 +69,7 @@ class KeptLight:
         if self._simulated:
             keep()
         else:
-            self._job = BackgroundJob("kept light", keep, niceness=MEASURING_NICENESS)
+            self._job = BackgroundJob("kept light", keep)
         solved_for_ns = refresh.solution.solved_for_ns if refresh.solution is not None else 0
         kept = _Kept(account, solved_for_ns, self._drawer.scene)
         if self._truth.is_recorded:

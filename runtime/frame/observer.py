@@ -97,6 +97,10 @@ class RunObserver:
         if self._measures and self.last is not None and not stopped():
             self._sampler.measure_retina(self.last)
 
+    def close(self) -> None:
+        """End the measuring process. May be called more than once."""
+        self._sampler.close()
+
     def live(self) -> dict[str, Any]:
         """Return the live quality measured so far, for the daemon's status (docs/contracts.md, Error)."""
         return {"live_db": self._sampler.live_db, "view_error_mm": self._lines.view_error_mm.of("p50", "p95")}

@@ -1,8 +1,8 @@
 """Measure the quality of a sample of refreshes, each once its true eyes are known.
 
-The solver draws the target pictures. In real time, a background thread compares them with one refresh's
-layers at a time, starting with the newest refresh. It works during only a small share of the run, because measuring
-must not slow down the solutions being measured. If refreshes come due while a measurement is running, a few of them are
+The solver draws the target pictures. In real time, another process compares them with one refresh's layers at a time
+(`measuring`), starting with the newest refresh. It works during only a small share of the run, because measuring must
+not slow down the solutions being measured. If refreshes come due while a measurement is running, a few of them are
 queued and measured after the run, and the others are dropped. On a simulated clock, every refresh that is due is
 measured, in order. For a page that shows the display live, the newest refresh is measured whenever its figure is out of
 date.
@@ -23,10 +23,10 @@ from runtime.evaluation.refresh_quality import (
     FIGURES,
     RefreshQuality,
     RefreshTargets,
-    measure_refresh,
     solved_eyes_of,
     true_eyes_of,
 )
+from runtime.frame.measuring import Comparison, MeasuringProcess, compared
 from runtime.frame.messages import Wanted
 from runtime.frame.refresh import Refresh
 from runtime.frame.targets import TargetDrawer
@@ -37,7 +37,7 @@ from runtime.optics.presentation import shown_layers
 from runtime.optics.quality import psnr_db
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, RefreshAccount, State
-from runtime.support.background import BACKGROUND_NICENESS, MEASURING_NICENESS, BackgroundJob
+from runtime.support.background import BackgroundJob
 
 HELD_MAX = 5  # maximum number of refreshes queued in real time
 HELD_BYTES = 200 << 20  # limit for the queued refreshes' layers; a refresh takes 25 MB at 1080p on the full raster
@@ -85,7 +85,8 @@ class QualitySampler:
         self._people: dict[int, list[float]] = {}  # the same errors, by number; 0: not served yet
         self.moment: Moment | None = None  # latest measured refresh, for the stills, contact sheet and viewer page
         self._waiting: deque[_Sample] = deque()
-        self._job: BackgroundJob[RefreshQuality] | None = None
+        self._job: BackgroundJob[RefreshQuality | None] | None = None
+        self._process = MeasuringProcess(stack)
         self._job_frame = self._moment_frame = -1
         self._samples = 0
         self.retina_db: float | None = None  # of the last refresh's solution (docs/contracts.md, Error)
@@ -182,7 +183,8 @@ class QualitySampler:
     def finish(self, last: Refresh) -> None:
         """Measure the last refresh, which counts towards the means only if no other one was measured."""
         account = self._truth.of(last.account)
-        quality = self._compared(last, account, self._drawn(self._wanted(last, account)))
+        targets = self._drawn(self._wanted(last, account))
+        quality = None if targets is None else compared(self._comparison(last, account, targets), self._stack)
         counts = not self.measured and last.account.state is State.TRACKING
         self._take(last.account.frame, quality, figures=counts, live=not self.live)
 
@@ -218,15 +220,15 @@ class QualitySampler:
             return
 
         def compare(targets: RefreshTargets | None) -> None:
-            if self._simulated:
-                self._take(frame, self._compared(refresh, account, targets))
-            elif targets is not None:
-                self._job_frame = frame
-                niceness = BACKGROUND_NICENESS if self._newest else MEASURING_NICENESS
-                self._job = BackgroundJob(
-                    "quality", lambda: self._compared(refresh, account, targets), niceness=niceness
-                )
             self._drawing = False
+            if targets is None:
+                return
+            comparison = self._comparison(refresh, account, targets)
+            if self._simulated:
+                self._take(frame, compared(comparison, self._stack))
+            else:
+                self._job_frame = frame
+                self._job = BackgroundJob("quality", lambda: self._process.compared(comparison))
 
         self._drawing = True
         self._drawer.draw(wanted, sample.scene, compare)
@@ -244,24 +246,8 @@ class QualitySampler:
             wanted["used"] = eyes[1], solution.solved_for_ns
         return wanted
 
-    def _compared(self, refresh: Refresh, account: RefreshAccount, targets: RefreshTargets | None) -> RefreshQuality:
-        if targets is None:
-            return RefreshQuality()
-        frame, carried = refresh.frame, None
-        if targets.used is not None:
-            aligned = replace(frame, parallax=None)
-            carried = shown_layers(aligned), shown_layers(replace(aligned, solved_from_shown=()))
-        layers = shown_layers(frame)
-        quality = measure_refresh(account, layers, carried, targets, self._stack, for_page=self._newest)
-        if quality.moment is None:
-            return quality
-        moment = replace(
-            quality.moment,
-            relief=frame.relief,
-            account=account,
-            state_version=refresh.state_version,
-        )
-        return replace(quality, moment=moment)
+    def _comparison(self, refresh: Refresh, account: RefreshAccount, targets: RefreshTargets) -> Comparison:
+        return Comparison(account, refresh.frame, targets, for_page=self._newest, state_version=refresh.state_version)
 
     def _take(self, frame: int, quality: RefreshQuality | None, *, figures: bool = True, live: bool = True) -> None:
         if quality is None:
@@ -274,6 +260,10 @@ class QualitySampler:
             self.live[frame] = quality.live_error
             for number, error in quality.people_errors.items():
                 self._people.setdefault(number, []).append(error)
+
+    def close(self) -> None:
+        """End the measuring process. May be called more than once."""
+        self._process.close()
 
     @property
     def live_db(self) -> float | None:

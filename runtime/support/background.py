@@ -1,4 +1,8 @@
-"""Background threads and jobs, by priority: first the presenter, then the solver, then the rest."""
+"""Background threads and jobs, and the presenter's priority over them.
+
+No thread of the presenter's process is less urgent than the solver: while it holds Python's lock, other work could keep
+it off the processors, and the presenter would wait for it. What computes for long has a process of its own.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +24,7 @@ PRESENTER_NICENESS = -10  # used if realtime priority is not allowed
 REALTIME_PRIORITY = 1  # lowest realtime priority, which still takes precedence over every ordinary thread
 SWITCH_S = 0.0005  # after which a thread that waits for Python's lock asks for it
 BACKGROUND_NICENESS = 10
-MEASURING_NICENESS = 15  # for measurements and file output, which are not urgent
+MEASURING_NICENESS = 15  # for measurements, which are not urgent
 # Time limit for waits after a stop request. The rest of the two seconds is left for calls without a timeout.
 STOPS_WITHIN_S = 1.2
 T = TypeVar("T")
@@ -61,8 +65,8 @@ def begin(name: str, run: Callable[..., None], *args: Any) -> threading.Thread:
 class BackgroundJob(Generic[T]):
     """Job on a background thread, started on construction. `done`, `problem` and `take` never block."""
 
-    def __init__(self, name: str, work: Callable[[], T], *, niceness: int = BACKGROUND_NICENESS) -> None:
-        self._name, self._work, self._niceness = name, work, niceness
+    def __init__(self, name: str, work: Callable[[], T]) -> None:
+        self._name, self._work = name, work
         self._result: T | None = None
         self.done = False
         self.problem = ""  # one-line reason why the job failed; empty: no failure
@@ -84,7 +88,6 @@ class BackgroundJob(Generic[T]):
 
     def _run(self) -> None:
         _running.add(threading.current_thread())
-        set_niceness(self._niceness)
         try:
             self._result = self._work()
         except PhasestackError as error:

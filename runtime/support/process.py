@@ -127,8 +127,8 @@ def _pair(undo: contextlib.ExitStack, theirs: contextlib.ExitStack) -> tuple[Cha
 
 class Worker:
     """A part of the program that runs in its own process. All methods are for one thread, such as the
-    presenter's, and none of them waits, except `wait_ready` and `close`. A thread of this object's own starts, watches
-    and restarts the process. It also passes on its log lines.
+    presenter's, and none of them waits, except `wait_ready`, `close`, and `receive` if asked to. A thread of this
+    object's own starts, watches and restarts the process. It also passes on its log lines.
     """
 
     def __init__(self, role: Role, arguments: Callable[[], tuple[Any, ...]], *, files: Sequence[int] = ()) -> None:
@@ -178,8 +178,10 @@ class Worker:
         except ChannelClosed:
             return False
 
-    def receive(self) -> list[Any]:
-        """Return all messages that have arrived, and `Began` and `Ended` for each process."""
+    def receive(self, timeout_s: float = 0.0) -> list[Any]:
+        """Return all messages that have arrived, and `Began` and `Ended` for each process. Waits up to
+        `timeout_s` for one.
+        """
         messages: list[Any] = []
         while self._lives:
             life = self._lives[0]
@@ -188,7 +190,7 @@ class Worker:
                 messages.append(Began(life.number))
             ended = life.ended  # read before the channel, because no message arrives after it
             with contextlib.suppress(ChannelClosed):
-                arrived = life.channel.receive()
+                arrived = life.channel.receive(0.0 if messages else timeout_s)
                 life.words[READ] += len(arrived)
                 messages += arrived
             if ended is None:
