@@ -13,9 +13,9 @@ from runtime.evaluation.refresh_quality import RefreshQuality, RefreshTargets, m
 from runtime.optics.presentation import shown_layers
 from runtime.optics.stack import PanelStack
 from runtime.records import PanelFrame, RefreshAccount
-from runtime.support.background import MEASURING_NICENESS
+from runtime.support.background import BACKGROUND_NICENESS
 from runtime.support.process import Ended, Parent, Role, Worker
-from runtime.support.untrusted_input import MIB
+from runtime.support.untrusted_input import LIMITS, MIB
 
 WITHIN_S = 60.0  # limit for one comparison
 IDLE_S = 60.0  # interval for renewing the time limit while there is nothing to do
@@ -91,4 +91,11 @@ def serve(parent: Parent, stack: PanelStack) -> None:
             parent.send(compared(job, stack))
 
 
-ROLE = Role("measurement", serve, niceness=MEASURING_NICENESS, memory_bytes=MEMORY_BYTES, oom_score=1000)
+ROLE = Role(
+    "measurement",
+    serve,
+    niceness=BACKGROUND_NICENESS,
+    memory_bytes=MEMORY_BYTES,
+    oom_score=1000,
+    start_s=LIMITS.start_s,
+)

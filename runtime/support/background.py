@@ -23,8 +23,7 @@ log = logging.getLogger("phasestack.background")
 PRESENTER_NICENESS = -10  # used if realtime priority is not allowed
 REALTIME_PRIORITY = 1  # lowest realtime priority, which still takes precedence over every ordinary thread
 SWITCH_S = 0.0005  # after which a thread that waits for Python's lock asks for it
-BACKGROUND_NICENESS = 10
-MEASURING_NICENESS = 15  # for measurements, which are not urgent
+BACKGROUND_NICENESS = 10  # for processes whose work is not urgent
 # Time limit for waits after a stop request. The rest of the two seconds is left for calls without a timeout.
 STOPS_WITHIN_S = 1.2
 T = TypeVar("T")

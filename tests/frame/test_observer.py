@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-import threading
+import os
+import signal
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import count
+from threading import Timer
 from typing import Any
 
 import numpy as np
@@ -13,9 +16,10 @@ import pytest
 from runtime.clock import NS_PER_MS, NS_PER_S
 from runtime.config import Settings
 from runtime.content.base import ContentInfo, ContentSource, View
-from runtime.evaluation import refresh_quality
 from runtime.evaluation.displayed import displayed
+from runtime.evaluation.refresh_quality import RefreshTargets
 from runtime.frame import refresh_lines, sampling
+from runtime.frame.measuring import Comparison
 from runtime.frame.messages import Draw, Facts, Order
 from runtime.frame.observer import RunObserver
 from runtime.frame.refresh import Refresh
@@ -28,7 +32,7 @@ from runtime.optics.presentation import shown_layers
 from runtime.plan.drawing import drawn_job, retina_pictures
 from runtime.plan.focusing import focus_targets, focused_job
 from runtime.records import Effort, PanelFrame, PersonAccount, RefreshAccount, SensorFrame, Solution, State
-from runtime.support.background import wait_for_all
+from runtime.support.background import BACKGROUND_NICENESS, wait_for_all
 from tests.frame.conftest import SMALL
 from tests.frame.fakes import EYES, FakeSolver, aside, facts
 from tests.waiting import eventually
@@ -40,6 +44,17 @@ CONTRACT = {
     "solution", "effort", "solved_for_m", "solution_age_ms", "true_eyes_m", "inference", "presented", "stage_ms",
     "skew_ms", "people",
 }  # fmt: skip
+
+
+made: list[RunObserver] = []
+
+
+@pytest.fixture(autouse=True)
+def closed() -> Iterator[None]:
+    """Ends the observers' processes."""
+    yield
+    while made:
+        made.pop().close()
 
 
 class Kept:
@@ -117,7 +132,9 @@ def looking(
 ) -> tuple[RunObserver, Kept]:
     kept = Kept()
     drawer = TargetDrawer(solver or Drawing(content))
-    return RunObserver(SMALL, drawer, output=kept, simulated=simulated, **how), kept
+    observer = RunObserver(SMALL, drawer, output=kept, simulated=simulated, **how)
+    made.append(observer)
+    return observer, kept
 
 
 # --- lines -------------------------------------------------------------------------------------------------------
@@ -364,20 +381,27 @@ def test_a_few_samples_that_came_meanwhile_are_measured_at_the_end(content: Cont
     assert observer.moment is not None and observer.moment.lines[0].startswith(f"Refresh {last}:")
 
 
-def test_comparing_is_not_the_presenter_s_nor_the_solver_s_work(
-    content: ContentSource, solved: Solution, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    threads = []
-    real = refresh_quality.displayed
-    monkeypatch.setattr(
-        refresh_quality,
-        "displayed",
-        lambda *a, **k: (threads.append(threading.current_thread().name), real(*a, **k))[1],
-    )
+def test_another_process_finds_the_same_figures_and_its_end_costs_one(content: ContentSource, solved: Solution) -> None:
+    inline, _ = looking(content, evaluate_every=1)
+    inline.refreshed(refresh(0, solved))
     observer, _ = looking(content, simulated=False, evaluate_every=1)
     observer.refreshed(refresh(0, solved))
     assert wait_for_all(120.0) == 0
-    assert threads == ["job quality"]
+    observer.finish(lambda: True)
+    assert observer.measured == inline.measured
+    assert observer.moment is not None and inline.moment is not None
+    np.testing.assert_array_equal(observer.moment.layers, inline.moment.layers)
+
+    process = observer._sampler._process
+    later = refresh(1, solved)
+    job = Comparison(later.account, later.frame, RefreshTargets(FOV_DEG), for_page=False, state_version=0)
+    assert process._worker is not None
+    pid = process._worker.status()["pid"]
+    assert os.getpriority(os.PRIO_PROCESS, pid) == BACKGROUND_NICENESS
+    os.kill(pid, signal.SIGSTOP)
+    Timer(0.2, os.kill, (pid, signal.SIGKILL)).start()
+    assert process.compared(job) is None
+    assert eventually(lambda: process.compared(job) is not None)
 
 
 # --- live quality ------------------------------------------------------------------------------------------------
