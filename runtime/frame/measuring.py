@@ -1,4 +1,4 @@
-"""Compare refreshes with their target pictures, in a process of their own if the run is in real time.
+"""Compare refreshes with their target pictures, in a separate process if the run is in real time.
 
 A thread of the presenter's process would hold Python's lock while other work keeps it off the processors, and the
 presenter would wait for it.

@@ -1,7 +1,7 @@
 """Background threads and jobs, and the presenter's priority over them.
 
 No thread of the presenter's process is less urgent than the solver: while it holds Python's lock, other work could keep
-it off the processors, and the presenter would wait for it. What computes for long has a process of its own.
+it off the processors, and the presenter would wait for it. Long computations run in separate processes.
 """
 
 from __future__ import annotations
