@@ -6,24 +6,24 @@ docs/programs.md describes the protocol. A separate thread serves the connection
 from __future__ import annotations
 
 import json
-import os
+import logging
 import struct
-import tempfile
 import threading
 import time
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from runtime.daemon.client import DEFAULT_SOCKET, NotRunning, ask, candidates
+from runtime.daemon.client import NotRunning, ask, sockets
 from runtime.errors import InputError, TransientError
 from runtime.records import F32, F64, U8
 from runtime.support.background import begin
 from runtime.support.extras import missing_extra
+
+log = logging.getLogger("phasestack.drawing")
 
 HEAD = struct.Struct("<II")  # frame number and eye (0 left, 1 right)
 AGAIN_S = 1.0  # pause before the next attempt to connect
@@ -75,28 +75,20 @@ def found_address() -> str:
     """Return the address for drawing programs of a running service, `run` or `try`, after selecting scene
     `program` there. Raises TransientError if nothing is running, or the scene does not start.
     """
-    tried = sorted(Path(tempfile.gettempdir()).glob("phasestack-*/status.sock"), key=_changed_s, reverse=True)
-    own = [path for path in tried if path.exists() and path.stat().st_uid == os.getuid()]
     until_s, asked = time.monotonic() + SCENE_S, False
     while time.monotonic() < until_s:
         try:
-            status = ask((*candidates(DEFAULT_SOCKET), *own), {"command": "status"})
+            status = ask(sockets(None), {"command": "status"})
         except NotRunning:
             raise TransientError("phasestack is not running; start `phasestack try --scene program`") from None
         program = status.get("program")
         if program:
             return str(program["address"])
         if not asked and "scene" in status:
-            ask((*candidates(DEFAULT_SOCKET), *own), {"command": "scene", "value": "program"}, timeout_s=SCENE_S)
+            ask(sockets(None), {"command": "scene", "value": "program"}, timeout_s=SCENE_S)
             asked = True
         time.sleep(0.1)
     raise TransientError("phasestack does not show the scene `program`; see `phasestack status`")
-
-
-def _changed_s(path: Path) -> float:
-    with suppress(OSError):
-        return path.stat().st_mtime
-    return 0.0
 
 
 class DrawingClient:
@@ -157,10 +149,13 @@ class DrawingClient:
                     self._socket, self.problem = socket, ""
                     for message in socket:
                         self._take(json.loads(message))
-                    self.problem = socket.close_reason or "phasestack closed the connection"
+                    problem = socket.close_reason or "phasestack closed the connection"
             except Exception as error:  # of any kind: the next attempt may succeed
                 reason = getattr(getattr(error, "rcvd", None), "reason", "")
-                self.problem = reason or str(error) or type(error).__name__
+                problem = reason or str(error) or type(error).__name__
+            if problem != self.problem and not self._ends.is_set():
+                log.warning("%s", problem)
+            self.problem = problem
             self._socket = self._memory = None
             self._ends.wait(AGAIN_S)
 

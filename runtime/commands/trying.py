@@ -21,7 +21,7 @@ import typer
 from runtime.browser.link import BrowserLink, PageMode
 from runtime.config import Settings, changed, load_settings, with_options
 from runtime.daemon.build import RunOptions
-from runtime.daemon.client import DaemonClient
+from runtime.daemon.client import DaemonClient, trial_folder
 from runtime.daemon.supervise import run_daemon
 from runtime.page.connections import LOOPBACK, listening, server_of
 from runtime.page.server import application
@@ -64,7 +64,7 @@ def try_display(settings: Settings, *, port: int, opens: bool, seconds: float | 
             return f"the page changed {', '.join(link.wishes)}"
         return "reached the time limit" if time.monotonic() > ends_s else ""
 
-    with tempfile.TemporaryDirectory(prefix="phasestack-") as folder:
+    with tempfile.TemporaryDirectory(prefix="phasestack-", dir=trial_folder()) as folder:
         socket = Path(folder) / "status.sock"
         service = {"socket": str(socket), "blackbox_minutes": 0.0}
         settings = changed(settings, "service", service, source="try")

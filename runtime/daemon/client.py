@@ -7,6 +7,7 @@ import json
 import os
 import socket
 import subprocess
+import tempfile
 import threading
 import time
 from collections.abc import Iterable
@@ -40,10 +41,23 @@ def candidates(configured: str) -> tuple[Path, ...]:
     return (Path(configured),) if own is None else (Path(configured), own)
 
 
+def trial_folder() -> Path:
+    """Return where each `phasestack try` has a folder `phasestack-*` with its socket."""
+    session = os.environ.get("XDG_RUNTIME_DIR", "")
+    return Path(session) if session and Path(session).is_dir() else Path(tempfile.gettempdir())
+
+
 def sockets(config: Path | None) -> tuple[Path, ...]:
-    """Return the sockets to try for a configuration file, or the default ones. Raises InputError."""
-    if config is None:
-        return candidates(DEFAULT_SOCKET)  # do not load the settings, because that would slow clients down
+    """Return the sockets to try for a configuration file, or the default ones and those of each
+    `phasestack try` of this user, newest first. Raises InputError.
+    """
+    if config is None:  # do not load the settings, because that would slow clients down
+        trials = []
+        for path in trial_folder().glob("phasestack-*/status.sock"):
+            with contextlib.suppress(OSError):
+                if (stat := path.stat()).st_uid == os.getuid():
+                    trials.append((stat.st_mtime, path))
+        return *candidates(DEFAULT_SOCKET), *(path for _, path in sorted(trials, reverse=True))
     from runtime.config import load_settings
 
     return candidates(load_settings(config).service.socket)

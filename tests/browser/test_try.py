@@ -160,6 +160,12 @@ def test_eyes_go_in_and_layers_come_out_solved_for_them(url: str) -> None:
         assert client.until(lambda c: c.refresh["state"] == "flat" and c.refresh["flatness"] == 1.0)
 
 
+def test_its_status_is_found(url: str) -> None:
+    command = [sys.executable, "-m", "runtime.cli", "status", "--json"]
+    asked = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert json.loads(asked.stdout)["state"], asked.stderr
+
+
 def test_a_slow_page_gets_the_present_not_the_past(url: str) -> None:
     with Client(url) as client:
         client.say(eyes=[[0.6, -0.03, 0.0], [0.6, 0.03, 0.0]], page_ms=1.0)
