@@ -198,7 +198,7 @@ def test_before_the_first_solution_the_flat_picture_is_shown_without_fading() ->
     stage.refresh(10)
     stage.solver.hand_over(solved=solution(2))
     (done,) = stage.refresh()
-    assert (done.frame.flatness, done.account.inference) == (0.0, "ran")
+    assert (done.frame.flatness, done.account.inference, done.account.effort) == (0.0, "ran", "1/1+0")
 
 
 def test_a_lost_viewer_is_held_then_fades_to_flat_and_back(stage: Stage) -> None:
