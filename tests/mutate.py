@@ -33,6 +33,7 @@ COPIED = ("runtime", "calib", "model_export", "phasestack", "tests", "examples",
 TESTS_OF = {
     "kernels": ("model", "panels", "optics"),
     "plan": ("plan", "frame"),
+    "optics": ("optics", "panels/test_presentation_table.py"),
     "browser": ("daemon", "browser"),
     "page": ("page", "browser"),
 }
