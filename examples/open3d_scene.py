@@ -7,6 +7,7 @@ It requires `pip install phasestack websockets open3d` and a Vulkan driver. Star
 from __future__ import annotations
 
 import time
+from typing import Any
 
 import numpy as np
 import open3d
@@ -19,7 +20,7 @@ APP = AppCamera(np.array([0, 0, 8.0]), np.zeros(3), np.array([0, 1.0, 0]), heigh
 BOUNDS = np.array([[-1.5, -1.5, -1.5], [1.5, 1.5, 1.5]])
 
 
-def opened(width_px: int, height_px: int) -> rendering.OffscreenRenderer:
+def opened(width_px: int, height_px: int) -> Any:
     """Return a renderer of the scene for pictures of this size."""
     renderer, look = rendering.OffscreenRenderer(width_px, height_px), rendering.MaterialRecord()
     look.shader, look.base_color = "defaultLit", (0.8, 0.2, 0.3, 1.0)
@@ -31,7 +32,8 @@ def opened(width_px: int, height_px: int) -> rendering.OffscreenRenderer:
 
 
 def main() -> None:
-    client, size, renderer = DrawingClient("", name="Open3D"), (0, 0), None
+    renderer: Any = None
+    client, size = DrawingClient("", name="Open3D"), (0, 0)
     while True:
         request = client.newest()
         if request is None:
