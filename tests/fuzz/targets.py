@@ -49,7 +49,7 @@ from runtime.sensor.replay import ReplayDriver
 from runtime.support.untrusted_input import parsed_json
 from tests.content.gltf_files import Buffer
 from tests.content.packed_splat_files import write_compressed, write_sog, write_splat, write_spz
-from tests.content.picture_files import equirectangular, film, heic_pair, lif, mpo, st3d, swapped_profile
+from tests.content.picture_files import film, heic_pair, lif, mpo, st3d, swapped_profile
 from tests.content.test_gltf import compressed, square
 from tests.content.test_splat import splat_table
 from tests.content.test_untrusted_files import PNG_URI, gltf, textured
@@ -224,9 +224,7 @@ def videos() -> list[bytes]:
             writer.release()
             made.append((Path(folder) / name).read_bytes())
         frame = np.full((48, 64, 3), 90, np.uint8)
-        for name, tags in (
-            ("a.mp4", {"added": st3d(2)}), ("a.mp4", {"added": equirectangular()}), ("a.mkv", {"mode": 1})
-        ):  # fmt: skip
+        for name, tags in (("a.mp4", {"added": st3d(2)}), ("a.mkv", {"mode": 1})):
             made.append(film(Path(folder) / name, frame, **tags).read_bytes())
     return made
 
