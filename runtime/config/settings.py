@@ -216,7 +216,8 @@ class CalibrationSettings(Section):
 LAYOUT = (
     r"^(auto|mono|(half-)?(side-by-side|top-bottom|cross-eyed)|anaglyph|rgbd|qs\d{1,6}x\d{1,6}(a(\d+(\.\d+)?|\.\d+))?)$"
 )
-# Settings of the content that place it, which `phasestack ctl place` changes while it runs.
+# Settings that place the content, changed by `phasestack ctl place`. A playlist's entries do not inherit them, another
+# scene resets them, and the status shows them.
 PLACING = ("scale", "offset_m", "rotation_deg", "turntable_per_min", "convergence_m", "comfort_deg")
 
 
@@ -274,7 +275,8 @@ class ContentSettings(Section):
         1.0, description="factor by which to scale the scene about the display's centre"
     )
     offset_m: tuple[Offset, Offset, Offset] = Field(
-        (0.0, 0.0, 0.0), description="offset of the scene in metres (out of the screen, to the right, up)"
+        (0.0, 0.0, 0.0),
+        description="offset of the scene in metres in the stack frame (out of the screen, to the right, up)",
     )
     rotation_deg: tuple[Turn, Turn, Turn] = Field(
         (0.0, 0.0, 0.0),

@@ -29,9 +29,11 @@ WHITE: Colour = (1.0, 1.0, 1.0)
 class View:
     """An eye, and the raster to draw its picture on."""
 
-    eye_m: F64  # (3,) position in frame `stack`
+    eye_m: F64  # (3,) position in the frame of the source that is asked: `stack` for the outermost
     side: int  # 0 is the left eye, 1 the right eye
-    pixels_from_stack: F64  # (3, 4) projection; the third coordinate is in metres, positive in front of the eye
+    # (3, 4) projection. The third coordinate is the distance in front of the eye in metres: along x for a raster's
+    # pixels, along the gaze for an eye's image.
+    pixels_from_stack: F64
     width_px: int
     height_px: int
     reduction: int = 1  # display pixels per raster pixel, in each direction; outlines keep their width on the display
@@ -49,7 +51,7 @@ class ContentInfo:
     background: Colour | None = WHITE  # uniform colour behind the scene, or None if the background is not uniform
     flat_x_m: float | None = None  # x coordinate of the plane that contains the whole scene, or None if not flat
     left_out: tuple[str, ...] = ()  # features in the file that are not drawn
-    fixed_views: bool = False  # True if only two views exist, such as a stereo pair's, for all eye positions
+    fixed_views: bool = False  # True if no pictures can be drawn for other points of a pupil
 
 
 class ContentSource(ABC):
@@ -69,9 +71,9 @@ class ContentSource(ABC):
         the top.
 
         Colours are already blended with the background. Alpha is the content's coverage and is 0 only where nothing but
-        the background is visible. The array is valid until the next call for the same side. `time_ns` is on the run's
-        clock and determines the state of moving content. Raises ContentFailure if the picture cannot be drawn at the
-        moment; the last picture then stays on the display.
+        the background is visible. The caller may not change the array, which is valid until the next call for the same
+        side. `time_ns` is on the run's clock and determines the state of moving content. Raises ContentFailure if the
+        picture cannot be drawn at the moment; the last picture then stays on the display.
         """
 
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture | None:
@@ -81,13 +83,12 @@ class ContentSource(ABC):
         return None
 
     def nearness(self, view: View, *, every: int, first: tuple[int, int]) -> F32 | None:
-        """Return the (h, w) inverse distances to the nearest point in each block of pixels, in 1/m, 0 for the
-        background.
+        """Return each pixel block's inverse distance to its nearest point, in 1/m, 0 for the background.
 
-        They belong to the latest picture drawn for the view's side, and are measured along the third coordinate of the
-        view's projection. Blocks are squares of `every` pixels; `first` columns and rows, less than `every`, are
-        missing from the first one. None if the distances are unknown: content is then aligned as if it were on the
-        middle panel.
+        The shape is (ceil((height_px + first[1]) / every), ceil((width_px + first[0]) / every)). The distances belong
+        to the latest picture drawn for the view's side, and are measured along the third coordinate of the view's
+        projection. Blocks are squares of `every` pixels; `first` columns and rows, less than `every`, are missing from
+        the first one. None if the distances are unknown: content is then aligned as if it were on the middle panel.
         """
         return None
 
@@ -171,6 +172,15 @@ class ForwardingSource(ContentSource):
     def extent(self, view: View, *, time_ns: int) -> PixelRect | None:
         source, view, time_ns = self.forwarded(view, time_ns)
         return source.extent(view, time_ns=time_ns)
+
+    def revision(self, *, time_ns: int) -> int:
+        return self.source.revision(time_ns=time_ns)
+
+    def describe(self, *, time_ns: int) -> dict[str, Any] | None:
+        return self.source.describe(time_ns=time_ns)
+
+    def skip(self, *, time_ns: int) -> bool:
+        return self.source.skip(time_ns=time_ns)
 
     def close(self) -> None:
         self.source.close()

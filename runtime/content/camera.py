@@ -29,7 +29,7 @@ def box_corners(low_m: ArrayLike, high_m: ArrayLike) -> F64:
     return np.array([[bounds[i, 0], bounds[j, 1], bounds[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
 
 
-def project(pixels_from_stack: F64, points_m: F64) -> tuple[F64, F64]:
+def pixels_and_depths(pixels_from_stack: F64, points_m: F64) -> tuple[F64, F64]:
     """Project points (n, 3) in `stack` to pixels (n, 2), undefined behind the eye, and depths in metres."""
     # A contiguous row per coordinate makes the arithmetic and the reductions several times as fast.
     homogeneous = pixels_from_stack[:, :3] @ points_m.T + pixels_from_stack[:, 3:]
@@ -41,7 +41,7 @@ def covered_box(view: View, points_m: F64, *, align_px: int = 32) -> PixelRect:
     """Return a box, in multiples of `align_px`, that contains the convex hull of points (n, 3) in
     `stack`, within the raster. It is empty if all points are behind the eye, and the whole raster if some of them are.
     """
-    pixels, depths = project(view.pixels_from_stack, points_m)
+    pixels, depths = pixels_and_depths(view.pixels_from_stack, points_m)
     if _bounds(depths)[1] <= 2 * NEAREST_M:
         return PixelRect(0, 0, 0, 0)
     size = [view.width_px, view.height_px]

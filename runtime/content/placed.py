@@ -7,7 +7,6 @@ for an eye whose position is given in the scene's frame.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -87,13 +86,7 @@ class PlacedSource(ForwardingSource):
         return self.source, moved, time_ns
 
     def revision(self, *, time_ns: int) -> int:
-        return time_ns if self.placing.turntable_per_min else self.source.revision(time_ns=time_ns)
-
-    def describe(self, *, time_ns: int) -> dict[str, Any] | None:
-        return self.source.describe(time_ns=time_ns)
-
-    def skip(self, *, time_ns: int) -> bool:
-        return self.source.skip(time_ns=time_ns)
+        return time_ns if self.placing.turntable_per_min else super().revision(time_ns=time_ns)
 
 
 def _moved(info: ContentInfo, placing: Placing) -> ContentInfo:

@@ -2,7 +2,7 @@
 
 It runs an event loop on a separate thread. No caller waits for a program: `ask` only leaves a request, and a
 program that reads slowly loses only its own messages. docs/programs.md describes the protocol. In a run on the real
-clock, it is part of a separate process (`program_link`).
+clock, it is part of a separate process (`daemon.programs`).
 """
 
 from __future__ import annotations

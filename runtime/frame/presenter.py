@@ -112,7 +112,7 @@ class Presenter:
         self.flat_asked = False
         self.paused = False
         self.missing: dict[str, str] = {}  # reason for each failed part
-        self.status: Status | None = None  # published once per refresh; all other threads read only this
+        self.status: Status | None = None  # published once per refresh, for any thread
         self._flatness = Flatness()
         self._presented = False
         self._shown_solution: int | None = None  # number of the solution shown at the previous refresh

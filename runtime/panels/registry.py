@@ -35,8 +35,8 @@ def panel_settings(settings: OutputSettings, count: int) -> tuple[PanelSettings,
 
 
 def open_panels(settings: OutputSettings, stack: PanelStack, clock: Clock, context: moderngl.Context) -> PanelSink:
-    """Open the output that `[output]` describes. After each call, `context`, the content's, is current
-    again. Raises InputError if settings cannot be used, and PanelLost for a monitor, which may be temporary.
+    """Open the output that `[output]` describes. After each call, `context` is current again. Raises
+    InputError if settings cannot be used, and PanelLost for a monitor, which may be temporary.
     """
     if settings.kind != "offscreen":
         from runtime.panels.window import WindowPanels

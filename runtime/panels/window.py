@@ -39,13 +39,13 @@ class WindowPanels(PanelSink):
     PanelLost. Later calls reopen them after half a second, or as soon as X reports that monitors have changed. If the X
     server dies, the process ends with exit status 75 and must be restarted.
 
-    GLFW requires that all methods are called on the main thread. After each, the `content` context is current again.
+    GLFW requires that all methods are called on the main thread. After each, `context` is current again.
     """
 
     name = "windows"
 
     def __init__(
-        self, panels: tuple[PanelSettings, ...], stack: PanelStack, clock: Clock, content: moderngl.Context, *,
+        self, panels: tuple[PanelSettings, ...], stack: PanelStack, clock: Clock, context: moderngl.Context, *,
         any_shape: bool = False, on_processor: bool | None = None,
     ) -> None:  # fmt: skip
         """Open a window for each panel, on monitors of any resolution (for `identify`) if `any_shape`. `on_processor`
@@ -54,13 +54,13 @@ class WindowPanels(PanelSink):
         """
         self._any_shape, self._on_processor = any_shape, on_processor
         self._panels, self._stack = panels, stack
-        self._clock, self._content = clock, content
+        self._clock, self._context = clock, context
         self._display: Display | None = None
         self._windows: PanelWindows | None = None
         self._watch: PlacementWatch | None = None
         self._retry_ns, self._lost = 0, ""
         self._shown = False  # True while the previous frame is on the windows
-        self._away = False  # True if a context other than `content` may be current
+        self._away = False  # True if a context other than `context` may be current
         self._context_lost = False
         self.monitors: tuple[Monitor, ...] = ()
         try:
@@ -194,8 +194,8 @@ class WindowPanels(PanelSink):
 
     def _give_back(self) -> None:
         if self._away:
-            content: Any = self._content
-            content.__enter__()
+            context: Any = self._context
+            context.__enter__()
             self._away = False
 
 

@@ -92,7 +92,7 @@ def focus_targets(content: ContentSource, eyes_m: Eyes, stack: PanelStack, *, ti
     """Draw the retina pictures of a viewer's two eyes that focus on the content's front, middle and rear.
 
     Returns:
-        The pictures, or None if the content has two views only or its depth is unknown.
+        The pictures, or None if the content has `fixed_views` or its depth is unknown.
 
     Raises:
         ContentFailure: The content could not be drawn.

@@ -12,7 +12,7 @@ from PIL import Image
 
 from runtime.config import ContentSettings
 from runtime.content import mesh
-from runtime.content.camera import project
+from runtime.content.camera import pixels_and_depths
 from runtime.content.mesh import load_mesh, prepare
 from runtime.content.parts import UNCOLOURED
 from runtime.content.placing import SceneFile, guessed_axes
@@ -80,7 +80,7 @@ def test_a_vertex_lands_where_the_projection_says(tmp_path: Path, drawn: Any) ->
     cone.export(path)
     view = panel_view((0.6, 0.0, 0.0), STACK.panel(1))
     picture = drawn(path, fit=False)
-    expected = project(view.pixels_from_stack, tip)[0][0]
+    expected = pixels_and_depths(view.pixels_from_stack, tip)[0][0]
     rows, columns = np.nonzero(picture[..., 3] > 0)
     farthest = columns.argmax()
     assert np.hypot(columns[farthest] + 0.5 - expected[0], rows[farthest] + 0.5 - expected[1]) < 2.5

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,12 @@ import pytest
 
 from runtime.clock import NS_PER_S
 from runtime.config import ContentSettings
-from runtime.content.camera import project
+from runtime.content.base import ContentInfo, ContentSource, ForwardingSource, View
+from runtime.content.camera import pixels_and_depths
 from runtime.content.placed import PlacedSource, Placing, placed_source
 from runtime.content.registry import open_content
 from runtime.optics.stack import PanelStack
+from runtime.records import U8
 from runtime.support.artifacts import write_png
 from tests.content.conftest import STACK, panel_view
 
@@ -31,7 +34,7 @@ def test_an_offset_moves_it_to_where_the_projection_says(drawn: Any) -> None:
     there = middle_of(drawn("sparse", EYE, offset_m=tuple(offset)))
     view = panel_view(EYE, STACK.panel(1))
     centre = np.array([0.02, 0.03, 0.0])  # of the ring
-    expected = project(view.pixels_from_stack, (centre + offset)[None])[0][0]
+    expected = pixels_and_depths(view.pixels_from_stack, (centre + offset)[None])[0][0]
     assert np.abs(there - expected).max() < 2.5
 
 
@@ -115,3 +118,46 @@ def test_depth_is_that_of_the_place_in_blocks_of_pixels(opened: Any) -> None:
         np.testing.assert_allclose(coarse, padded.reshape(coarse.shape[0], 4, -1, 4).max((1, 3)), rtol=1e-5)
         nearest_m.append(1 / fine.max())
     assert nearest_m[0] - nearest_m[1] == pytest.approx(0.05, abs=1e-3)
+
+
+class Inner(ContentSource):
+    """Source that only notes what it is asked."""
+
+    def __init__(self) -> None:
+        self.asked: list[str] = []
+
+    def __getattribute__(self, name: str) -> Any:
+        if name in MEMBERS:
+            self.asked.append(name)
+        return super().__getattribute__(name)
+
+    def render(self, view: View, *, time_ns: int) -> U8:
+        return np.zeros((1, 1, 4), np.uint8)
+
+
+class Outer(ForwardingSource):
+    """Source that shows another one, unchanged."""
+
+    def __init__(self, source: ContentSource) -> None:
+        self.source, self.info = source, ContentInfo("outer")
+
+    def forwarded(self, view: View, time_ns: int) -> tuple[ContentSource, View, int]:
+        return self.source, view, time_ns
+
+
+MEMBERS = [name for name in vars(ContentSource) if not name.startswith("_") and name != "Options"]
+
+
+@pytest.mark.parametrize("name", MEMBERS)
+def test_a_forwarding_source_forwards_every_request(name: str) -> None:
+    inner = Inner()
+    inner.info = ContentInfo("inner")
+    outer = Outer(inner)
+    view = panel_view(EYE, STACK.panel(1))
+    outer.render(view, time_ns=0)  # `nearness` is asked of the source that drew last
+    inner.asked.clear()
+    member = getattr(outer, name)
+    if callable(member):
+        given = {"view": view, "views": [view], "time_ns": 0, "every": 1, "first": (0, 0)}
+        member(**{key: given[key] for key in inspect.signature(member).parameters})
+    assert inner.asked == [name]

@@ -10,7 +10,7 @@ import pytest
 
 from runtime.content import shapes
 from runtime.content.base import View
-from runtime.content.camera import clip_from_stack, depth_bounds, project
+from runtime.content.camera import clip_from_stack, depth_bounds, pixels_and_depths
 from runtime.content.procedural import ProceduralSource
 from runtime.content.scenes import SCENES, Scene, Thing
 from runtime.content.triangles import DrawnPart, _Look
@@ -49,7 +49,7 @@ def test_a_point_lands_where_the_projection_says(
         panel_view(eye, STACK.panel(0)),
         image_view(eye, 640, 360, fov_deg=60),
     ):
-        expected = project(view.pixels_from_stack, np.array([point]))[0][0]
+        expected = pixels_and_depths(view.pixels_from_stack, np.array([point]))[0][0]
         margin = 20
         if not (margin < expected[0] < view.width_px - margin and margin < expected[1] < view.height_px - margin):
             continue
@@ -69,7 +69,7 @@ def test_the_nearer_of_two_surfaces_hides_the_other(context: Any, make: Any) -> 
     for parts in ((red, blue), (blue, red)):
         source = ProceduralSource(Scene("two", parts), stack=STACK, context=context)
         picture = source.render(view, time_ns=0)
-        u, v = (int(value) for value in project(view.pixels_from_stack, front[None])[0][0])
+        u, v = (int(value) for value in pixels_and_depths(view.pixels_from_stack, front[None])[0][0])
         assert picture[v, u].tolist() == [255, 0, 0, 255]
         source.close()
 
