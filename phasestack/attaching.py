@@ -132,13 +132,14 @@ class Attachment:
             return
         camera, size = shown.GetActiveCamera(), tuple(window.GetSize())
         renderers = [one for one in _items(window.GetRenderers()) if one.GetActiveCamera() is camera]
-        swaps, hidden = window.GetSwapBuffers(), not window.GetShowWindow()
+        swaps, hidden, dpi = window.GetSwapBuffers(), not window.GetShowWindow(), window.GetDPI()
         placed = self._placed(shown, request, size)
         drawn_px = [max(1, round(edge * self._size)) for edge in (request.width_px, request.height_px)]
         try:
             window.SetSwapBuffers(False)
             if hidden:
                 window.SetSize(*drawn_px)
+                window.SetDPI(max(1, round(dpi * drawn_px[1] / size[1])))  # text is as large as in the window
             for eye in request.eyes:
                 eye_view = self._camera(eye_camera(eye, placed))
                 for renderer in renderers:
@@ -150,6 +151,7 @@ class Attachment:
                 renderer.SetActiveCamera(camera)
             if hidden:
                 window.SetSize(*size)
+                window.SetDPI(dpi)
             window.SetSwapBuffers(swaps)
         self.frames += 1
         took_s = time.monotonic() - begun_s
