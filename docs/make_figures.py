@@ -107,9 +107,12 @@ def architecture() -> Figure:
     figure = Figure(figsize=(11, 5.6), layout="constrained")
     axes = blank(figure, 111, (0, 22), (0, 11))
     processes = (
-        (0.2, 7.3, 21.6, 3.1, "#eef4fb", "sensor's process"),
+        (0.2, 7.3, 10.0, 3.1, "#eef4fb", "sensor's process"),
+        (10.5, 7.3, 5.4, 3.1, "#f7eef8", "measuring process"),
+        (16.2, 7.3, 5.6, 3.1, "#f4f4e8", "page's process"),
         (0.2, 3.9, 21.6, 3.1, "#fdf1e7", "presenter's process: the display's clock, one refresh after another"),
-        (0.2, 0.5, 21.6, 3.1, "#eef8ee", "solver's process: at its own pace"),
+        (0.2, 0.1, 4.9, 3.5, "#e9f6f6", "program server's process"),
+        (5.4, 0.1, 16.4, 3.5, "#eef8ee", "solver's process: at its own pace"),
     )
     for x, y, width, height, colour, name in processes:
         axes.add_patch(
@@ -119,20 +122,28 @@ def architecture() -> Figure:
     white = "#ffffff"
     box(axes, 0.6, 7.8, 4.2, 1.6, "sensor: driver or recording\nsensor/polling.py", white)
     box(axes, 5.7, 7.8, 4.2, 1.6, "eyes: pupils in pictures\neyes/detect.py", white)
+    box(axes, 10.9, 7.8, 4.6, 1.6, "quality: light at the eyes\nframe/measuring.py", white)
+    box(axes, 16.7, 7.8, 4.6, 1.6, "page: state and commands\npage/server.py", white)
     box(axes, 0.6, 4.4, 4.2, 1.6, "calibration: sensor to stack\neyes/calibration.py", white)
     box(axes, 5.7, 4.4, 4.2, 1.6, "tracker: predicts the eyes\neyes/tracker.py", white)
     box(axes, 12.2, 4.4, 4.4, 1.6, "alignment: scale and shift\noptics/alignment.py", white)
     box(axes, 17.4, 4.4, 4.2, 1.6, "panels: one refresh\npanels/presentation.py", white)
+    box(axes, 0.55, 1.0, 4.2, 1.6, "programs: their pictures\ndaemon/programs.py", white)
     box(axes, 5.7, 1.0, 4.2, 1.6, "policy: solve, reuse or flat\nframe/policy.py", white)
     box(axes, 10.8, 1.0, 4.2, 1.6, "content: a picture per eye\nplan/drawing.py", white)
     box(axes, 15.9, 1.0, 4.2, 1.6, "model: pictures to layers\nmodel/solver.py", white)
     for start, end in (
         ((4.9, 8.6), (5.6, 8.6)), ((4.9, 5.2), (5.6, 5.2)), ((10.0, 5.2), (12.1, 5.2)), ((16.7, 5.2), (17.3, 5.2)),
         ((10.0, 1.8), (10.7, 1.8)), ((15.1, 1.8), (15.8, 1.8)), ((7.0, 7.7), (3.4, 6.1)), ((7.8, 4.3), (7.8, 2.7)),
-        ((16.3, 2.7), (16.3, 4.3)),
+        ((16.3, 2.7), (16.3, 4.3)), ((13.2, 6.9), (13.2, 7.7)), ((18.8, 6.9), (18.8, 7.7)), ((19.2, 7.7), (19.2, 6.9)),
+        ((12.9, 0.35), (12.9, 0.95)),
     ):  # fmt: skip
         arrow(axes, start, end)
+    axes.plot([2.65, 2.65, 12.9], [0.9, 0.4, 0.4], lw=1.4, color=INK, solid_joinstyle="miter")
     axes.text(6.4, 7.15, "samples", fontsize=9, va="center")
+    axes.text(13.05, 7.15, "refreshes", fontsize=9, va="center", ha="right")
+    axes.text(18.65, 7.15, "status", fontsize=9, va="center", ha="right")
+    axes.text(19.35, 7.15, "commands", fontsize=9, va="center")
     axes.text(7.95, 3.6, "eyes to solve for", fontsize=9, va="center")
     axes.text(16.15, 3.6, "newest solution", fontsize=9, va="center", ha="right")
     return figure
