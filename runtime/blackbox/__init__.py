@@ -1,1 +1,1 @@
-"""Record a run for debugging, keeping the last few minutes in memory."""
+"""Record a run for debugging, keeping the last few minutes in memory and a journal on disk."""

@@ -1,5 +1,8 @@
 """Black box that writes a run's last few minutes to an MCAP file, on request or after a fault.
 
+Every few seconds, new messages are appended to a journal on disk. When a run ends normally, its journal is deleted. If
+the run is ended by a power cut or killed, the next run finds the journal and renames it as a file of kind `cut`.
+
 The files can also be used as recordings: `run --replay` plays back their samples through the same code. Messages are
 serialised as they arrive, so that the garbage collector never has to visit them. The files are written by a background
 job.
@@ -14,11 +17,12 @@ import os
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, NamedTuple, Self
@@ -48,11 +52,14 @@ AFTER_FAULT_NS = 5 * NS_PER_S  # how long to keep recording after a fault before
 FAULTS_APART_NS = 60 * NS_PER_S  # minimum time between files of one kind, so that repeated faults do not fill the disk
 STATE_EVERY_NS = NS_PER_S  # interval between state messages while the state stays the same
 WRITTEN_WITHIN_S = 5.0  # how long to wait for the last file at the end of a run
-CHUNK_BYTES = 16384
+JOURNAL_EVERY_NS = 3 * NS_PER_S  # at most this much is lost in a power cut, plus one chunk
+CHUNK_BYTES = 16384  # the journal's chunk size
+CUT = "cut"  # kind of file recovered from a journal
 LINES_KEPT, STATES_KEPT = 200, 50  # how many log lines and states are kept for the operator's page
 FILES_MAX = 20  # maximum number of files kept in the folder
 PREFIX = "blackbox-"
 ASKED = "asked"  # kind of file requested by an operator
+JOURNAL = "journal"
 PART = ".part"  # suffix of an unfinished file
 
 LOG, REFRESH, STATE = "/log", "/refresh", "/state"
@@ -125,7 +132,7 @@ class Recorder(logging.Handler):
     """
 
     def __init__(self, folder: Path, *, minutes: float) -> None:
-        """Prepare the folder. 0 minutes keep and write nothing."""
+        """Prepare the folder, and recover the journal if the last run was killed. 0 minutes keep and write nothing."""
         super().__init__()
         self._folder, self._most_ns = folder, round(60 * minutes * NS_PER_S)
         self._kept_lock = threading.Lock()
@@ -144,9 +151,13 @@ class Recorder(logging.Handler):
         self._waiting_lock, self._is_writing = threading.Lock(), False
         self._waiting: dict[str, list[Saved]] = {}  # requests for files not yet started by the writer, by kind
         self._writer: BackgroundJob[None] | None = None
+        self._fresh = 0  # how many of the newest messages are not in the journal yet
+        self._journal, self._journaled_ns = _Journal(folder), 0
+        self._journaling: BackgroundJob[None] | None = None
         if self._most_ns:
             import mcap.writer  # noqa: F401 - fails at the start if mcap is not installed
 
+            _find_cut(folder)
             make_room(folder)
         _sweep(folder)
 
@@ -178,6 +189,15 @@ class Recorder(logging.Handler):
             self._state, self._state_ns = state, at_ns
             self._keep(STATE, state_message(*state, monotonic_ns=at_ns))
         self._keep(REFRESH, refresh_message(account), account.frame)
+        is_due = at_ns - self._journaled_ns >= JOURNAL_EVERY_NS
+        if self._most_ns and is_due and (self._journaling is None or self._journaling.done):
+            self._journaled_ns = at_ns
+            with self._kept_lock:
+                fresh = list(islice(reversed(self._kept), self._fresh))[::-1]
+                self._fresh = 0
+            # The journal is written in the background, because a refresh must not wait for the disk.
+            work = partial(self._journal.add, fresh, *_head(self._presenter), most_ns=self._most_ns)
+            self._journaling = BackgroundJob("black box's journal", work)
         if self._fault is not None and at_ns - self._fault[0] >= AFTER_FAULT_NS:
             kind, self._fault = self._fault[1], None
             self.save(kind)
@@ -205,9 +225,11 @@ class Recorder(logging.Handler):
         at_ns = self._presenter.clock.now_ns()
         with self._kept_lock:
             self._kept.append(BlackBoxMessage(at_ns, time.time_ns(), topic, data, sequence & 0xFFFFFFFF))
+            self._fresh += 1
             self._bytes += len(data) + OVERHEAD_BYTES
             while self._kept and (self._bytes > BYTES_MAX or at_ns - self._kept[0].at_ns > self._most_ns):
                 self._bytes -= len(self._kept.popleft().data) + OVERHEAD_BYTES
+            self._fresh = min(self._fresh, len(self._kept))  # limits the memory used if the journal hangs
 
     def save(self, kind: str, saved: Saved = lambda problem, path: None) -> None:
         """Write all messages to a file named by `kind` in the background, then call `saved` with a problem or
@@ -284,8 +306,11 @@ class Recorder(logging.Handler):
         if self._fault is not None:
             self.save(self._fault[1])
         self._fault = None
-        if self._writer is not None:
-            self._writer.wait(WRITTEN_WITHIN_S)
+        for job in (self._writer, self._journaling):
+            if job is not None:
+                job.wait(WRITTEN_WITHIN_S)
+        if self._writer is None or self._writer.done:  # if not, keep the journal for the next run
+            self._journal.close(in_use=self._journaling is not None and not self._journaling.done)
         self._presenter = None
         super().close()
 
@@ -297,21 +322,19 @@ def _head(presenter: Presenter) -> tuple[RecordingHeader, str]:
     return header, without_secrets(settings.model_dump_json())
 
 
-def write_file(
-    folder: Path, kind: str, kept: Iterable[BlackBoxMessage], header: RecordingHeader, settings: str
-) -> Path:
+def write_file(folder: Path, kind: str, kept: list[BlackBoxMessage], header: RecordingHeader, settings: str) -> Path:
     """Write messages to a new file, atomically, and return its path. Raises OSError if that fails. The
     file can be read only by its owner, because it shows how viewers moved. The number in its name is higher than any
     other in the folder, because dates may be wrong if the wall clock has been set back.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    others = (*folder.glob(f"{PREFIX}*.mcap"), *folder.glob(f".{PREFIX}*{PART}"))
-    number = 1 + max(map(_number, others), default=0)
-    path = folder / f"{PREFIX}{number:06}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{kind}.mcap"
+    path = _next_name(folder, kind, datetime.now(UTC))
     part = path.with_name(f".{path.name}{PART}")
     with _opened(part) as file:
         try:
-            _write(file, kept, header, settings)
+            written = _Written(file, header, settings)
+            written.add(kept)
+            written.writer.finish()
             file.flush()
             put_in_place(part, path)
         except BaseException:
@@ -320,29 +343,94 @@ def write_file(
     return path
 
 
+def _next_name(folder: Path, kind: str, at: datetime) -> Path:
+    others = (*folder.glob(f"{PREFIX}*.mcap"), *folder.glob(f".{PREFIX}*{PART}"))
+    number = 1 + max(map(_number, others), default=0)
+    return folder / f"{PREFIX}{number:06}-{at:%Y%m%dT%H%M%SZ}-{kind}.mcap"
+
+
 def _opened(part: Path) -> IO[bytes]:
     file = os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600), "wb")
     fcntl.flock(file, fcntl.LOCK_EX)  # `_sweep` deletes any partial file that is not locked
     return file
 
 
-def _write(file: IO[bytes], kept: Iterable[BlackBoxMessage], header: RecordingHeader, settings: str) -> None:
-    """Write an MCAP file."""
-    from mcap.writer import CompressionType, Writer
+class _Written:
+    """Writes messages to an open MCAP file."""
 
-    writer: Any = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)
-    writer.start(profile="phasestack", library=f"phasestack {version()}")
-    writer.add_metadata(fmt.METADATA_NAME, header.metadata())
-    writer.add_attachment(0, 0, "settings.json", "application/json", settings.encode())
-    channels: dict[str, int] = {}
-    for message in kept:
-        topic, at_ns = message.topic, message.wall_ns
-        if topic not in channels:
-            schema = SCHEMAS[topic]
-            number = writer.register_schema(schema["title"], "jsonschema", json.dumps(schema).encode())
-            channels[topic] = writer.register_channel(topic, "json", number)
-        writer.add_message(channels[topic], at_ns, message.data, at_ns, message.sequence)
-    writer.finish()
+    def __init__(self, file: IO[bytes], header: RecordingHeader, settings: str) -> None:
+        from mcap.writer import CompressionType, Writer
+
+        self.writer: Any = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)
+        self.writer.start(profile="phasestack", library=f"phasestack {version()}")
+        self.writer.add_metadata(fmt.METADATA_NAME, header.metadata())
+        self.writer.add_attachment(0, 0, "settings.json", "application/json", settings.encode())
+        self._channels: dict[str, int] = {}
+
+    def add(self, messages: list[BlackBoxMessage]) -> None:
+        for message in messages:
+            topic = message.topic
+            if topic not in self._channels:
+                schema = SCHEMAS[topic]
+                number = self.writer.register_schema(schema["title"], "jsonschema", json.dumps(schema).encode())
+                self._channels[topic] = self.writer.register_channel(topic, "json", number)
+            at_ns = message.wall_ns
+            self.writer.add_message(self._channels[topic], at_ns, message.data, at_ns, message.sequence)
+
+
+class _Journal:
+    """A journal of the most recent messages on disk, which alternates between two files. Each file holds at most half
+    the time and half the bytes kept by the black box.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._current, self._begun_ns = folder, 0, 0
+        self._file: IO[bytes] | None = None
+        self._written: _Written | None = None
+
+    def add(self, fresh: list[BlackBoxMessage], header: RecordingHeader, settings: str, *, most_ns: int) -> None:
+        """Write messages to disk immediately. If this fails, the journal ends but the run continues."""
+        now_ns = time.monotonic_ns()
+        try:
+            if self._file is None or now_ns - self._begun_ns > most_ns // 2 or self._file.tell() > BYTES_MAX // 2:
+                self._current, self._begun_ns = 1 - self._current, now_ns
+                if self._file is not None:
+                    self._file.close()
+                self._folder.mkdir(parents=True, exist_ok=True)
+                self._path.unlink(missing_ok=True)
+                self._file = _opened(self._path)
+                self._written = _Written(self._file, header, settings)
+            assert self._written is not None
+            self._written.add(fresh)
+            self._file.flush()
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            log.warning("cannot write the black box's journal: %s", error.strerror)
+            self.close()
+
+    @property
+    def _path(self) -> Path:
+        return self._folder / f".{PREFIX}{JOURNAL}{self._current}{PART}"
+
+    def close(self, *, in_use: bool = False) -> None:
+        """Delete the journal after the run has ended normally, without closing a file that is still `in_use`."""
+        if self._file is not None and not in_use:
+            with suppress(OSError):
+                self._file.close()
+            self._file = None
+        for self._current in (0, 1):
+            with suppress(OSError):
+                self._path.unlink(missing_ok=True)
+
+
+def _find_cut(folder: Path) -> None:
+    """If a run was killed, rename its journals as permanent files."""
+    for journal in sorted(folder.glob(f".{PREFIX}{JOURNAL}*{PART}"), key=lambda path: path.stat().st_mtime):
+        with suppress(OSError), journal.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            at = datetime.fromtimestamp(journal.stat().st_mtime, UTC)
+            journal.rename(path := _next_name(folder, CUT, at))
+            log.warning("the previous run did not exit cleanly; its last minutes are in %s", path)
 
 
 def make_room(folder: Path) -> None:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import stat
 import subprocess
 import sys
 import threading
+import time
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from itertools import groupby
@@ -20,6 +22,8 @@ from typing import Any
 import jsonschema
 import numpy as np
 import pytest
+from mcap.exceptions import EndOfFile, RecordLengthLimitExceeded
+from mcap.reader import NonSeekingReader
 
 from runtime.blackbox import recorder as recording
 from runtime.blackbox.recorder import Recorder, make_room, write_file
@@ -33,6 +37,7 @@ from runtime.sensor.recording import Recording, recording_to
 from runtime.sensor.recording_format import RecordingHeader
 from runtime.sensor.replay import demo_recording_path
 from tests.daemon.rig import Rig
+from tests.waiting import eventually
 
 SMALL: dict[str, Any] = {
     "stack": {"width_px": 64, "height_px": 36},
@@ -128,6 +133,29 @@ def test_it_keeps_no_more_than_its_minutes_and_its_bytes(tmp_path: Path, monkeyp
         rig.refreshes(3)
         assert recorder.describe()["kept_mib"] * (1 << 20) <= 20_000 * 1.1
         recorder.close()
+
+
+def test_a_journal_that_hangs_costs_no_more_memory_than_is_kept(tmp_path: Path, monkeypatch: Any) -> None:
+    """Entries waiting for the journal used to be kept without bound."""
+    hangs, added, add = threading.Event(), [], recording._Journal.add
+    monkeypatch.setattr(recording, "JOURNAL_EVERY_NS", 0)
+    monkeypatch.setattr(recording, "BYTES_MAX", 20_000)
+
+    def slow(self: Any, fresh: list[Any], *more: Any, **named: Any) -> None:
+        added.append(len(fresh))
+        if len(added) == 1:
+            assert hangs.wait(60.0)
+        add(self, fresh, *more, **named)
+
+    monkeypatch.setattr(recording._Journal, "add", slow)
+    recorder = Recorder(tmp_path, minutes=2.0)
+    with Rig(recorder=recorder) as rig:
+        rig.refreshes(300)
+        assert len(added) == 1
+        hangs.set()
+        rig.refresh_until(lambda: len(added) > 1)
+        recorder.close()
+    assert 10 < added[1] < 100  # 20,000 bytes hold no more
 
 
 def test_a_fault_writes_what_preceded_and_followed_it_for_its_owner_alone(tmp_path: Path, monkeypatch: Any) -> None:
@@ -242,7 +270,7 @@ def test_many_requests_in_one_second_all_get_whole_files(tmp_path: Path) -> None
     assert [problem for problem, _ in answers if problem] == []
     there = sorted(tmp_path.glob("blackbox-*.mcap"))
     assert all(len(read(path)) > 50 for path in there) and there[-1] == answers[-1][1]
-    assert not [path for path in tmp_path.iterdir() if path not in there]
+    assert not [path for path in tmp_path.iterdir() if path not in there and recording.JOURNAL not in path.name]
 
 
 def test_setting_the_clock_back_does_not_age_the_newest_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -296,3 +324,24 @@ def test_leftovers_of_a_killed_writer_are_swept_but_not_files_being_written(tmp_
         assert left.name.endswith(".part")
     (whole,) = tmp_path.iterdir()
     assert busy.returncode == 0 and len(read(whole)) == 1
+
+
+def test_after_a_kill_the_next_run_finds_all_but_the_last_seconds(tmp_path: Path) -> None:
+    config = tmp_path / "a.toml"
+    config.write_text(f'[stack]\nwidth_px = 64\nheight_px = 36\n[model]\nname = "fast"\nthreads = 1\nbackend = "cpu"\n'
+                      f'[service]\nsocket = "{tmp_path}/s.sock"\n')  # fmt: skip
+    command = [sys.executable, "-m", "runtime.cli", "run", "--config", config, "--replay", "demo", "--headless"]
+    with subprocess.Popen(command, env={**os.environ, "STATE_DIRECTORY": str(tmp_path)}) as run:
+        boxes = tmp_path / "blackbox"
+        assert eventually(lambda: any(path.stat().st_size > 200_000 for path in boxes.glob(".*.part")))
+        killed_ns = time.monotonic_ns()
+        run.kill()
+    Recorder(boxes, minutes=1).close()
+    (cut,) = boxes.iterdir()
+    assert cut.name.endswith("-cut.mcap")
+    at_ns = []
+    with cut.open("rb") as file, suppress(EndOfFile, RecordLengthLimitExceeded):
+        for _, channel, message in NonSeekingReader(file).iter_messages(log_time_order=False):
+            at_ns += [json.loads(message.data)["present_ns"]] if channel.topic == "/refresh" else []
+    assert killed_ns - at_ns[-1] < recording.JOURNAL_EVERY_NS + 9 * NS_PER_S and len(at_ns) > 100  # of a busy machine
+    assert sum(1 for _ in Recording(cut).samples()) > 50  # it is a recording as others are
