@@ -240,7 +240,7 @@ class ContentSettings(Section):
         description="background colour as RGB values from 0 to 1 (default: white for built-in scenes, dark "
         "for all others)",
     )
-    file: PathText = Field("", description="data for a preset: a .ply or .glb file")
+    file: PathText = Field("", description="data for a preset: a .ply file, a .glb file or a data-set folder")
     layout: Annotated[str, Field(pattern=LAYOUT)] = Field(
         "auto",
         description="arrangement of the views: mono, [half-]side-by-side, [half-]top-bottom, [half-]cross-eyed (right "

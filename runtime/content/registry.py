@@ -84,7 +84,9 @@ def _prepared(file: SceneFile) -> Opener:
         return _built_in(name, file)
     if name in preset_names():
         if not settings.file:
-            problem = f"is missing; set it to the .ply or .glb file of {name}, which is not shipped"
+            problem = (
+                f"is missing; set it to the .ply file, .glb file or data-set folder of {name}, which is not shipped"
+            )
             raise InputError("content", "file", problem)
         return _from_path(replace(file, path=Path(settings.file), preset=name))
     if name in LIVE:
@@ -151,7 +153,7 @@ def _read(file: SceneFile) -> Opener:
         from runtime.content import compressed_splats, eyereal, splat
 
         if eyereal.is_data_set(path):
-            raise InputError(path, "", "is a folder of EyeReal's data set, which can only be evaluated (docs/paper.md)")
+            return eyereal.prepare(file)
         if compressed_splats.is_sog_folder(path):
             return splat.prepare(file)
     elif suffix in MESHES:

@@ -25,6 +25,7 @@ from runtime.content.registry import prepare_content
 from runtime.support.artifacts import write_png
 from tests.content.conftest import STACK, panel_view
 from tests.content.picture_files import lif, make_video
+from tests.content.test_eyereal import write_pair
 from tests.content.test_pictures import rgbd_picture, solid
 from tests.content.test_splat import splat_table, written
 from tests.content.test_untrusted_files import painted, png
@@ -33,7 +34,7 @@ pytestmark = pytest.mark.child
 MIB = 1 << 20
 
 
-def written_as(kind: str, folder: Path) -> Path:
+def written_as(kind: str, folder: Path, context: Any) -> Path:
     path = folder / f"scene.{kind}"
     match kind:
         case "splats":
@@ -44,6 +45,10 @@ def written_as(kind: str, folder: Path) -> Path:
             for number in range(3):
                 write_png(folder / f"{number}.png", solid((9, 40 * number, 60)))
             return folder
+        case "pairs":
+            (folder / "lego_bulldozer").mkdir()
+            write_pair(folder / "lego_bulldozer", context)
+            return folder / "lego_bulldozer"
         case "depth":
             write_png(folder / "a_rgbd.png", rgbd_picture())
             return folder / "a_rgbd.png"
@@ -59,12 +64,12 @@ def written_as(kind: str, folder: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    "kind", ["glb", "gltf", "obj", "off", "ply", "stl", "splats", "tif", "leia", "depth", "mp4", "a folder"]
+    "kind", ["glb", "gltf", "obj", "off", "ply", "stl", "splats", "tif", "leia", "depth", "mp4", "a folder", "pairs"]
 )
 def test_what_was_read_there_is_drawn_as_what_is_read_here(
     kind: str, tmp_path: Path, context: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = written_as(kind, tmp_path)
+    path = written_as(kind, tmp_path, context)
     used: list[Any] = []
     real = registry.in_child
     monkeypatch.setattr(registry, "in_child", lambda *given, **how: (used.append(given), real(*given, **how))[1])
