@@ -17,7 +17,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.middleware import Middleware
 from starlette.middleware.base import BaseHTTPMiddleware
 from starlette.requests import ClientDisconnect, HTTPConnection, Request
-from starlette.responses import HTMLResponse, JSONResponse, Response
+from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.websockets import WebSocket
 
@@ -27,12 +27,14 @@ from runtime.daemon.client import LOOKED_UP_AGAIN_S, REQUEST_MAX_BYTES, REQUEST_
 from runtime.daemon.commands import NAMES
 from runtime.errors import InputError
 from runtime.page.live import live
+from runtime.page.metrics import exposition
 from runtime.page.token import same
 from runtime.support.artifacts import to_json
 from runtime.support.untrusted_input import parsed_json
 
 SCRIPT, STYLE = "text/javascript", "text/css"
 PROTOCOL = "phasestack"  # WebSocket subprotocol
+METRICS = "text/plain; version=0.0.4; charset=utf-8"  # media type of the Prometheus text format
 ASSETS = {"page.css": STYLE, "look.css": STYLE}
 ASSETS |= dict.fromkeys(("session.js", "page.js", "display.js", "look.js", "try.js", "choice.js"), SCRIPT)
 HEADERS = {
@@ -106,6 +108,12 @@ def application(daemon: DaemonClient, token: str, *, link: BrowserLink | None = 
         answer = await run_in_threadpool(daemon.look_up, name)
         return JsonAnswer(answer, 200 if answer.get("ok") else 503)
 
+    async def metrics(request: Request) -> Response:
+        answer = await run_in_threadpool(daemon.look_up, "status")
+        if not answer.get("ok"):
+            return PlainTextResponse(f"{answer.get('error', '')}\n", 503)
+        return PlainTextResponse(exposition(answer), media_type=METRICS)
+
     async def do(request: Request) -> Response:
         try:
             command = parsed_json(await _body(request), source="the request")
@@ -122,6 +130,7 @@ def application(daemon: DaemonClient, token: str, *, link: BrowserLink | None = 
     routes: list[BaseRoute] = [
         Route("/", index, methods=["GET"]),
         Route("/do", guarded(do), methods=["POST"]),
+        Route("/metrics", guarded(metrics), methods=["GET"]),
         Route("/now/{name}", guarded(look_up), methods=["GET"]),
         Route("/operator", operator, methods=["GET"]),
         WebSocketRoute("/live", connected),

@@ -31,7 +31,7 @@ from tests.page.rig import ROOT, Page, page_of, short_folder
 from tests.test_cli import refusal
 from tests.waiting import eventually
 
-PATHS = ("/now/status", "/now/pictures", "/now/log", "/now/about", "/do")
+PATHS = ("/metrics", "/now/status", "/now/pictures", "/now/log", "/now/about", "/do")
 
 
 class Loop:
@@ -108,6 +108,25 @@ def test_with_the_token_it_tells_what_the_daemon_tells(page: Page, loop: Loop) -
     assert eventually(lambda: page.look_up("pictures").get("frame") == 7)
     assert eventually(lambda: page.look_up("about").get("scenes") == ["demo"])
     assert page.look_up("other") == {"ok": False, "error": "unknown lookup"}
+
+
+def test_prometheus_reads_the_figures_of_the_status(page: Page, loop: Loop) -> None:
+    status = {"state": "tracking", "live_db": 22.5, "light_db": None, "presented": 60, "paused": True,
+              "scene": 'a"b', "view_error_mm": {"p50": 4.0, "p95": 9.5}, "efforts": {"1/2+1": 3.5},
+              "stage_ms": {"wait": None}}  # fmt: skip
+    loop.server.publish(lambda: status)
+    wanted = {
+        'phasestack_state{state="tracking"} 1', "phasestack_live_db 22.5", "phasestack_presented 60",
+        r'phasestack_scene{scene="a\"b"} 1', 'phasestack_view_error_mm{quantile="0.5"} 4.0',
+        'phasestack_view_error_mm{quantile="0.95"} 9.5', 'phasestack_efforts{effort="1/2+1"} 3.5',
+    }  # fmt: skip
+
+    def samples() -> set[str]:
+        code, headers, body = page.ask("GET", "/metrics", **page.bearer)
+        assert code == 200 and headers["content-type"].startswith("text/plain; version=0.0.4")
+        return {line for line in body.decode().splitlines() if not line.startswith("#")}
+
+    assert eventually(lambda: wanted <= samples()), samples()
 
 
 def test_who_goes_away_while_asking_makes_no_error(tmp_path: Path) -> None:
