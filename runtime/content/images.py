@@ -8,12 +8,24 @@ import numpy as np
 from runtime.content.base import View
 from runtime.optics.rpu import panel_from_image
 from runtime.optics.stack import PlaneRaster, between_pixel_centres
+from runtime.optics.views import image_from_raster
 from runtime.records import F64, U8
 
 
 def rgba_from_rgb(rgb: U8) -> U8:
     """Convert an RGB picture (h, w, 3) to opaque RGBA (h, w, 4). OpenCV warps RGBA in half the time."""
     return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA))
+
+
+def image_from_view(image_from_stack: F64, pixels_from_stack: F64) -> F64 | None:
+    """Return the 3x3 homography from a view's pixels to those of a picture shown on the plane x = 0,
+    given 3x4 projections. Any other plane gives the same result for one eye position. None if the view's eye is in the
+    plane.
+    """
+    # This raster's pixel coordinates are metres along y (u) and -z (v).
+    plane = PlaneRaster(x_m=0.0, left_m=0.0, top_m=0.0, pitch_u_m=1.0, pitch_v_m=1.0, width_px=1, height_px=1)
+    plane_from_view = plane_from_pixels(pixels_from_stack, plane)
+    return None if plane_from_view is None else image_from_raster(image_from_stack, plane) @ plane_from_view
 
 
 def plane_from_pixels(pixels_from_stack: F64, plane: PlaneRaster) -> F64 | None:
