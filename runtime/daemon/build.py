@@ -24,6 +24,7 @@ from runtime.errors import InputError, PanelLost, Stopped
 from runtime.eyes.calibration import load_calibration
 from runtime.eyes.detect import EyeFinder
 from runtime.frame.kept_light import Output
+from runtime.frame.measuring import MeasuringProcess
 from runtime.frame.messages import Facts, Live
 from runtime.frame.observer import RunObserver
 from runtime.frame.pacing import Pacer
@@ -81,6 +82,7 @@ class Run:
 
     presenter: Presenter
     observer: RunObserver
+    measuring: MeasuringProcess
     programs: Programs | None  # None on a simulated clock, where the solver serves programs itself
 
     @property
@@ -97,7 +99,8 @@ class Run:
         """Return the current use of memory and processor time by each of the run's processes."""
         own = {"role": "presenter", "restarts": 0, **usage(os.getpid())}
         programs = [] if self.programs is None else self.programs.status()
-        return [own, *self.presenter.solver.status(), *self.presenter.samples.status(), *programs]
+        solver, sensor = self.presenter.solver.status(), self.presenter.samples.status()
+        return [own, *solver, *sensor, *programs, *self.measuring.status()]
 
     def summary(self) -> dict[str, Any]:
         """Return the contents of summary.json (docs/contracts.md)."""
@@ -177,6 +180,8 @@ def build_run(
         samples = sensor = start_sensor(settings, clock, options.browser)
     cleanup.callback(samples.close)
     solver: SolverHost
+    measuring = MeasuringProcess(stack)
+    cleanup.callback(measuring.close)
     if not simulated:
         lost: list[PanelSink] = []
         programs = Programs()
@@ -189,6 +194,8 @@ def build_run(
             contexts_lost=lambda: sum(sink.contexts_lost for sink in lost),
         )
         cleanup.callback(solver.close)
+        if options.measure:
+            measuring.begin()
     host.starting("creating the OpenGL context")
     context = offscreen_context()
     cleanup.callback(context.release)
@@ -211,6 +218,7 @@ def build_run(
     observer = RunObserver(
         stack,
         TargetDrawer(solver),
+        measuring,
         evaluate_every=settings.loop.evaluate_every if options.measure else None,
         keep_light=options.keep_light,
         output=output,
@@ -218,7 +226,6 @@ def build_run(
         simulated=simulated,
         newest=options.browser is not None,
     )
-    cleanup.callback(observer.close)
     pacer = Pacer(
         period_ns=panels.period_ns or round(NS_PER_S / settings.loop.rate_hz),
         photon_ns=round(settings.loop.scanout_ms * NS_PER_MS),
@@ -246,7 +253,7 @@ def build_run(
         host.recorder.watches(presenter, in_stack_frame=in_stack_frame)
     if not simulated:
         cleanup.enter_context(before_all_others())  # affects only this thread, because all others have already started
-    run = Run(presenter, observer, None if simulated else programs)
+    run = Run(presenter, observer, measuring, None if simulated else programs)
     host.watches(run)
     return run
 

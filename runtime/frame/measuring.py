@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 from dataclasses import dataclass, replace
+from typing import Any
 
 from runtime.evaluation.refresh_quality import RefreshQuality, RefreshTargets, measure_refresh
 from runtime.optics.presentation import shown_layers
@@ -48,12 +49,21 @@ def compared(job: Comparison, stack: PanelStack) -> RefreshQuality:
 
 
 class MeasuringProcess:
-    """Process that measures one refresh at a time. It is started for the first one."""
+    """Process that measures one refresh at a time. It starts for the first one, unless it has begun before."""
 
     def __init__(self, stack: PanelStack) -> None:
         self._stack = stack
         self._worker: Worker | None = None
         self._closing = threading.Event()
+
+    def begin(self) -> Worker:
+        """Start the process, and return it. Raises TransientError if the system cannot."""
+        self._worker = self._worker or Worker(ROLE, lambda: (self._stack,))
+        return self._worker
+
+    def status(self) -> list[dict[str, Any]]:
+        """Return the process and its resources, for the status. Empty if it has not begun."""
+        return [] if self._worker is None else [self._worker.status()]
 
     def compared(self, job: Comparison) -> RefreshQuality | None:
         """Measure a refresh's quality, and wait for it. For one thread at a time. Returns None if the process
@@ -61,7 +71,7 @@ class MeasuringProcess:
         """
         if job.frame.flatness == 0.0:
             job = replace(job, frame=replace(job.frame, flat=None))
-        worker = self._worker = self._worker or Worker(ROLE, lambda: (self._stack,))
+        worker = self.begin()
         worker.wait_ready(lambda: not self._closing.is_set())
         worker.receive()  # what an earlier process has left
         if not worker.send(job):

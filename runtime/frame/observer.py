@@ -8,6 +8,7 @@ from typing import Any
 from runtime.clock import NS_PER_S
 from runtime.evaluation.contact_sheet import Moment
 from runtime.frame.kept_light import KeptLight, Output
+from runtime.frame.measuring import MeasuringProcess
 from runtime.frame.refresh import Refresh
 from runtime.frame.refresh_lines import RefreshLines
 from runtime.frame.sampling import QualitySampler, has_picture
@@ -24,6 +25,7 @@ class RunObserver:
         self,
         stack: PanelStack,
         drawer: TargetDrawer,
+        measuring: MeasuringProcess,
         *,
         evaluate_every: int | None = None,
         keep_light: int = 0,
@@ -41,7 +43,13 @@ class RunObserver:
         self.truth = TrueEyes()
         self._lines = RefreshLines(self.truth, output.refresh if output is not None else None)
         self._sampler = QualitySampler(
-            stack, drawer, self.truth, every=evaluate_every or 0, simulated=simulated, newest=newest
+            stack,
+            drawer,
+            self.truth,
+            measuring,
+            every=evaluate_every or 0,
+            simulated=simulated,
+            newest=newest,
         )
         self._kept = KeptLight(keep_light, output, drawer, self.truth, simulated=simulated) if output else None
 
@@ -96,10 +104,6 @@ class RunObserver:
                 self._sampler.finish(last)
         if self._measures and self.last is not None and not stopped():
             self._sampler.measure_retina(self.last)
-
-    def close(self) -> None:
-        """End the measuring process. May be called more than once."""
-        self._sampler.close()
 
     def live(self) -> dict[str, Any]:
         """Return the live quality measured so far, for the daemon's status (docs/contracts.md, Error)."""

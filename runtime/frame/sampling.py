@@ -68,12 +68,13 @@ class QualitySampler:
         stack: PanelStack,
         drawer: TargetDrawer,
         truth: TrueEyes,
+        measuring: MeasuringProcess,
         *,
         every: int,
         simulated: bool,
         newest: bool = False,
     ) -> None:
-        self._stack, self._drawer, self._truth = stack, drawer, truth
+        self._stack, self._drawer, self._truth, self._measuring = stack, drawer, truth, measuring
         self._every, self._simulated, self._newest = every, simulated, newest
         self._rests_at: RefreshAccount | None = None  # has the eyes since `_rests_since_s`, to within `MOVED_M`
         self._rests_since_s = 0.0
@@ -86,7 +87,6 @@ class QualitySampler:
         self.moment: Moment | None = None  # latest measured refresh, for the stills, contact sheet and viewer page
         self._waiting: deque[_Sample] = deque()
         self._job: BackgroundJob[RefreshQuality | None] | None = None
-        self._process = MeasuringProcess(stack)
         self._job_frame = self._moment_frame = -1
         self._samples = 0
         self.retina_db: float | None = None  # of the last refresh's solution (docs/contracts.md, Error)
@@ -228,7 +228,7 @@ class QualitySampler:
                 self._take(frame, compared(comparison, self._stack))
             else:
                 self._job_frame = frame
-                self._job = BackgroundJob("quality", lambda: self._process.compared(comparison))
+                self._job = BackgroundJob("quality", lambda: self._measuring.compared(comparison))
 
         self._drawing = True
         self._drawer.draw(wanted, sample.scene, compare)
@@ -260,10 +260,6 @@ class QualitySampler:
             self.live[frame] = quality.live_error
             for number, error in quality.people_errors.items():
                 self._people.setdefault(number, []).append(error)
-
-    def close(self) -> None:
-        """End the measuring process. May be called more than once."""
-        self._process.close()
 
     @property
     def live_db(self) -> float | None:

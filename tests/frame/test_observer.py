@@ -19,7 +19,7 @@ from runtime.content.base import ContentInfo, ContentSource, View
 from runtime.evaluation.displayed import displayed
 from runtime.evaluation.refresh_quality import RefreshTargets
 from runtime.frame import refresh_lines, sampling
-from runtime.frame.measuring import Comparison
+from runtime.frame.measuring import Comparison, MeasuringProcess
 from runtime.frame.messages import Draw, Facts, Order
 from runtime.frame.observer import RunObserver
 from runtime.frame.refresh import Refresh
@@ -46,12 +46,12 @@ CONTRACT = {
 }  # fmt: skip
 
 
-made: list[RunObserver] = []
+made: list[MeasuringProcess] = []
 
 
 @pytest.fixture(autouse=True)
 def closed() -> Iterator[None]:
-    """Ends the observers' processes."""
+    """Ends the measuring processes."""
     yield
     while made:
         made.pop().close()
@@ -132,9 +132,8 @@ def looking(
 ) -> tuple[RunObserver, Kept]:
     kept = Kept()
     drawer = TargetDrawer(solver or Drawing(content))
-    observer = RunObserver(SMALL, drawer, output=kept, simulated=simulated, **how)
-    made.append(observer)
-    return observer, kept
+    made.append(MeasuringProcess(SMALL))
+    return RunObserver(SMALL, drawer, made[-1], output=kept, simulated=simulated, **how), kept
 
 
 # --- lines -------------------------------------------------------------------------------------------------------
@@ -392,11 +391,11 @@ def test_another_process_finds_the_same_figures_and_its_end_costs_one(content: C
     assert observer.moment is not None and inline.moment is not None
     np.testing.assert_array_equal(observer.moment.layers, inline.moment.layers)
 
-    process = observer._sampler._process
+    process = made[-1]
     later = refresh(1, solved)
     job = Comparison(later.account, later.frame, RefreshTargets(FOV_DEG), for_page=False, state_version=0)
-    assert process._worker is not None
-    pid = process._worker.status()["pid"]
+    (used,) = process.status()
+    pid = used["pid"]
     assert os.getpriority(os.PRIO_PROCESS, pid) == BACKGROUND_NICENESS
     os.kill(pid, signal.SIGSTOP)
     Timer(0.2, os.kill, (pid, signal.SIGKILL)).start()
@@ -499,7 +498,8 @@ def test_a_coarse_solution_is_measured_as_the_panels_show_it(content: ContentSou
 
 def test_a_reload_draws_the_new_scene_in_its_field_of_view(content: ContentSource, solved: Solution) -> None:
     solver, kept = Drawing(content), Kept()
-    observer = RunObserver(SMALL, TargetDrawer(solver), evaluate_every=1, keep_light=1, output=kept, simulated=True)
+    drawer, measuring = TargetDrawer(solver), MeasuringProcess(SMALL)
+    observer = RunObserver(SMALL, drawer, measuring, evaluate_every=1, keep_light=1, output=kept, simulated=True)
     observer.sampled(sample(NS_PER_S))
     observer.refreshed(refresh(1, solved))
     solver.content, solver.scene, solver.fov_deg = Moving(), 2, 30.0
