@@ -49,7 +49,7 @@ def compared(job: Comparison, stack: PanelStack) -> RefreshQuality:
 
 
 class MeasuringProcess:
-    """Process that measures one refresh at a time. It starts for the first one, unless it has begun before."""
+    """Process that measures one refresh at a time. It begins with the first one, if not before."""
 
     def __init__(self, stack: PanelStack) -> None:
         self._stack = stack
