@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from runtime.config import Settings
 from runtime.daemon.build import RunOptions
 from runtime.daemon.drive import drive
 from runtime.evaluation.motion_recording import write_motion
-from runtime.frame.served import accounts_of, matched, moved_m2
+from runtime.frame.served import accounts_of, matched, moved_m2, sigma_factor
 from runtime.frame.viewer import together
 from runtime.optics.alignment import align, common_movement_m
 from runtime.optics.stack import PanelStack
@@ -80,10 +81,57 @@ def test_a_new_person_does_not_move_the_picture_of_the_first() -> None:
     assert first.solved_for_m is not None and second.solved_for_m is None and second.number == 2
 
 
-def test_movement_that_is_not_shared_counts_more() -> None:
-    alike, apart = TWO + np.array([0, 0.01, 0]), TWO + np.repeat([[0, 0.01, 0], [0, -0.01, 0]], 2, axis=0)
-    assert moved_m2(TWO, apart) > 4 * moved_m2(TWO, alike)
-    assert moved_m2(TWO, alike) == pytest.approx(moved_m2(TWO[:2], alike[:2]))
+@pytest.mark.parametrize(
+    ("numbers", "solved_for", "now"),
+    [
+        ((3, 1), (0, 2), (1, 0)),  # each where they are in either; the one who has left is left out
+        ((7, 3), (2,), (1,)),
+        ((7, 8), (0,), (0,)),  # nobody it was computed for: the first ones
+    ],
+)
+def test_the_same_people_are_compared_wherever_they_are_listed(
+    numbers: tuple[int, ...], solved_for: tuple[int, ...], now: tuple[int, ...]
+) -> None:
+    three, present = eyes_at((0.6, -0.2, 0.0), (0.6, 0.0, 0.0), (0.6, 0.2, 0.0)), TWO + np.array([0.0, 0.0, 0.1])
+    solved_for_m, eyes_m = matched(solution((1, 2, 3), three), estimate(numbers, present))
+    np.testing.assert_array_equal(solved_for_m, np.concatenate([three[2 * n : 2 * n + 2] for n in solved_for]))
+    np.testing.assert_array_equal(eyes_m, np.concatenate([present[2 * n : 2 * n + 2] for n in now]))
+
+
+def test_an_eye_that_sees_nothing_is_replaced_by_its_person_s_other() -> None:
+    one_eyed = replace(solution((1, 2), TWO), seeing=(True, True, False, True))
+    np.testing.assert_array_equal(matched(one_eyed, estimate((2,), TWO[2:]))[1], TWO[[3, 3]])
+    np.testing.assert_array_equal(matched(one_eyed, estimate((1, 2), TWO))[1], TWO[[0, 1, 3, 3]])
+
+
+@pytest.mark.parametrize(
+    ("first_mm", "second_mm", "expected_mm2"),
+    [
+        ((3, 4, 12), None, 169),
+        ((0, 10, 0), (0, 10, 0), 100),
+        ((0, 10, 0), (0, -10, 0), 900),  # each has moved 100, and shares none of it, which counts eight times more
+        ((0, 10, 0), (0, 30, 0), 2100),  # 100 and 900, and eight times 400
+    ],
+)
+def test_movement_that_is_not_shared_counts_more(first_mm: Any, second_mm: Any, expected_mm2: float) -> None:
+    moved_mm = [first_mm] if second_mm is None else [first_mm, second_mm]
+    before_m = TWO[: 2 * len(moved_mm)]
+    found_m2 = moved_m2(before_m, before_m + np.repeat(np.array(moved_mm) / 1e3, 2, axis=0))
+    assert found_m2 == pytest.approx(expected_mm2 / 1e6)
+    assert [sigma_factor(people) for people in (0, 1, 2, 3)] == pytest.approx([1.0, 1.0, 3.0, 3.0])
+
+
+def test_accounts_name_the_eyes_that_each_person_s_picture_is_for() -> None:
+    assert accounts_of(solution((1,), TWO[:2]), EyesEstimate(0, 0, None, "none")) == ()
+    (only,) = accounts_of(None, estimate((), TWO[:2]))
+    assert (only.number, only.solved_for_m) == (1, None)
+    second, first = accounts_of(solution((1, 2), TWO), estimate((2, 1), TWO[[2, 3, 0, 1]]))
+    for account, eyes_m in ((first, TWO[:2]), (second, TWO[2:])):
+        np.testing.assert_array_equal(account.eyes_m, eyes_m)
+        np.testing.assert_array_equal(account.solved_for_m, eyes_m)
+    newer, other = accounts_of(solution((1, 2), TWO), estimate((7, 8), TWO))  # the first is shown another's picture
+    np.testing.assert_array_equal(newer.solved_for_m, TWO[:2])
+    assert other.solved_for_m is None
 
 
 def test_estimates_of_two_people_are_one_of_four_eyes() -> None:
@@ -92,6 +140,11 @@ def test_estimates_of_two_people_are_one_of_four_eyes() -> None:
     assert together([one, two]).people == (1, 5)
     np.testing.assert_array_equal(together([one, two]).eyes_m, TWO)
     assert together([one, lost]) is one and together([lost, lost]) is lost
+    held = EyesEstimate(5, 4, TWO[2:], "held", 0.007, (5,))
+    assert [together([one, two]).label, together([one, held]).label] == ["predicted", "predicted"]
+    assert together([held, held]).label == "held"
+    both = together([held, one, lost])
+    assert (both.time_ns, both.capture_ns, both.sigma_m) == (5, 4, pytest.approx(0.005)), "RMS of 7 and 1 mm"
 
 
 def run(folder: Path, motion: str, *, panels: int, seconds: float, **tables: Any) -> tuple[dict[str, Any], list[Any]]:
