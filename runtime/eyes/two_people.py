@@ -54,7 +54,7 @@ def _along(times_s: F64, stops: dict[float, tuple[float, float, float]]) -> tupl
 
 
 def _pass(times_s: F64) -> tuple[F64, F64]:
-    """The first sits still. The second walks past behind them every four seconds, at up to 1.5 m/s."""
+    """The first sits still. The second walks past behind them every four seconds, at up to 1.9 m/s."""
     knots = np.arange(0.0, times_s.max() + 8.0, 4.0)
     place = np.array([1.3, 0.0, STANDING_M]) + np.where(np.arange(len(knots)) % 2, 1.6, -1.6)[:, None] * [0, 1, 0]
     # Walk for 3.2 s, then stay out of sight for 0.8 s.
@@ -81,14 +81,14 @@ def _leave(times_s: F64) -> tuple[F64, F64]:
     x, y, z = SEATS_M[1]
     aside, gone = (x + 0.3, y + 0.2, STANDING_M), (x + 0.6, 2.2, STANDING_M)
     stops = {0.0: (x, y, z), 4.0: (x, y, z), 5.0: aside, 6.6: gone, 8.0: gone, 9.6: aside, 10.6: (x, y, z)}
-    return _both(_seated("still", 0, times_s), _along(times_s, {**stops, 1e6: (x, y, z)}))
+    return _both(_seated("still", 0, times_s), _along(times_s, stops))
 
 
 def _sit(times_s: F64) -> tuple[F64, F64]:
     """The second comes from the side after two seconds and sits down next to the first."""
     x, y, z = SEATS_M[1]
     aside, gone = (x + 0.3, y + 0.2, STANDING_M), (x + 0.6, 2.2, STANDING_M)
-    stops = {0.0: gone, 2.0: gone, 3.6: aside, 4.6: (x, y, z), 1e6: (x, y, z)}
+    stops = {0.0: gone, 2.0: gone, 3.6: aside, 4.6: (x, y, z)}
     return _both(_seated("still", 0, times_s), _along(times_s, stops))
 
 

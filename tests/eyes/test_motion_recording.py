@@ -13,7 +13,7 @@ from runtime.errors import InputError
 from runtime.evaluation.motion_recording import write_motion
 from runtime.eyes.calibration import demo_stack_from_sensor
 from runtime.eyes.motions import MOTIONS, observe, path_of, true_eyes
-from runtime.eyes.two_people import MOTIONS_OF_TWO, true_eyes_of_two
+from runtime.eyes.two_people import MOTIONS_OF_TWO
 from runtime.sensor.recording import Recording
 from tests.calls import answered, invoked
 
@@ -99,10 +99,3 @@ def test_two_people_are_recorded_nearest_first_each_where_they_are(tmp_path: Pat
             nearest, other = (np.linalg.norm(eyes_m.mean(axis=0)) for eyes_m in people)
             assert nearest <= other + 1e-6
     assert seen_together > 60 and np.mean(np.array(off_m) < 1e-5) > 0.9
-
-
-def test_two_people_never_touch() -> None:
-    times_s = np.arange(0.0, 24.0, 0.05)
-    for motion in MOTIONS_OF_TWO:
-        middles = true_eyes_of_two(motion, times_s).reshape(-1, 2, 2, 3).mean(axis=2)
-        assert np.nanmin(np.linalg.norm(middles[:, 0] - middles[:, 1], axis=1)) > 0.2
