@@ -22,8 +22,8 @@ PLACES: list[tuple[str, int, dict[float, Place]]] = [
     ("two-pass", 0, {0.0: LEFT, 1.6: LEFT, 9.6: LEFT}),
     ("two-pass", 1, {0.0: AWAY, 1.2: (1.3, -0.719, 0.35), 1.6: (1.3, 0.0, 0.35), 2.0: (1.3, 0.719, 0.35)}),
     ("two-pass", 1, {3.2: AWAY, 5.2: (1.3, 0.719, 0.35), 5.6: (1.3, 0.0, 0.35), 9.2: (1.3, -0.719, 0.35)}),
-    ("two-exchange", 0, {0.0: LEFT, 4.0: LEFT, 5.0: (0.52, 0.0, 0.0), 6.0: RIGHT, 10.0: RIGHT}),
-    ("two-exchange", 0, {11.0: (0.52, 0.0, 0.0), 12.0: LEFT, 16.0: LEFT, 18.0: RIGHT}),
+    ("two-exchange", 0, {0.0: LEFT, 4.0: LEFT, 4.5: (0.57, -0.11, 0.0), 5.0: (0.52, 0.0, 0.0), 6.0: RIGHT}),
+    ("two-exchange", 0, {10.0: RIGHT, 11.0: (0.52, 0.0, 0.0), 12.0: LEFT, 16.0: LEFT, 18.0: RIGHT}),
     ("two-exchange", 1, {4.0: RIGHT, 5.0: (0.99, 0.0, 0.0), 6.0: LEFT, 10.0: LEFT, 12.0: RIGHT}),
     ("two-leave", 0, {0.0: LEFT, 5.0: LEFT, 10.6: LEFT}),
     ("two-leave", 1, {0.0: RIGHT, 4.0: RIGHT, 4.5: (0.81, 0.32, 0.175), 5.0: STANDING, 5.4: WALKING_OFF, 6.6: AWAY}),
@@ -67,7 +67,7 @@ def test_the_sensor_sees_35_degrees_to_either_side() -> None:
 @pytest.mark.parametrize(("aside_m", "is_hidden"), [(0.19, False), (0.17, True), (-0.17, True), (-0.19, False)])
 @pytest.mark.parametrize("axis", [1, 2])
 def test_a_head_hides_what_is_behind_its_width(aside_m: float, axis: int, is_hidden: bool) -> None:
-    near, far = np.tile(SENSOR + [0.5, 0.0, 0.0], (2, 1)), np.tile(SENSOR + [1.0, 0.0, 0.0], (2, 1))
+    near, far = np.tile(SENSOR + [0.5, 0.0, 0.0], (2, 1)), np.tile(SENSOR + [1.25, 0.0, 0.0], (2, 1))
     far[:, axis] += aside_m
     gone = np.full((2, 3), np.nan)
     eyes = np.stack([np.vstack(pair) for pair in ((near, far), (far, near), (near, gone), (gone, far))])
