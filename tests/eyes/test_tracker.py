@@ -21,6 +21,7 @@ MS = 1_000_000
 PERIOD = 33_333_333
 STILL = np.array([[0.6, -0.031, 0.03], [0.6, 0.031, 0.03]])
 SURE = np.ones(2)
+FINE_M2 = 1e-6 * np.eye(3)  # the covariance of the eyes' midpoint
 HOLD_MS = round(1000 * TrackerSettings().hold_s)
 
 
@@ -38,8 +39,14 @@ def moving(k: float, speed: tuple[float, float, float] = (0.0, 0.3, 0.0)) -> NDA
     return STILL + np.array(speed) * (k * PERIOD / 1e9)
 
 
-def fed(count: int = 30, motion: Callable[..., Any] = lambda k: STILL, **noise: Any) -> tuple[Tracker, int]:
-    tracker = Tracker()
+def aside(y_m: float, **how: Any) -> EyePoints:
+    return points(STILL + np.array([0.0, y_m, 0.0]), **how)
+
+
+def fed(
+    count: int = 30, motion: Callable[..., Any] = lambda k: STILL, hold_s: float = 0.5, **noise: Any
+) -> tuple[Tracker, int]:
+    tracker = Tracker(TrackerSettings(hold_s=hold_s))
     for k in range(count):
         tracker.update(points(motion(k), **noise), capture_ns=10**9 + k * PERIOD)
     return tracker, 10**9 + (count - 1) * PERIOD
@@ -87,9 +94,24 @@ def test_a_lost_face_is_held_coming_to_rest_then_nobody() -> None:
 
 def test_a_stalled_stream_is_held_even_without_word_of_a_loss() -> None:
     tracker, last = fed()
-    assert tracker.at(last + 190 * MS).label == "predicted"
-    assert tracker.at(last + 210 * MS).label == "held"
-    assert tracker.at(last + (HOLD_MS + 10) * MS).label == "none"
+    after = {0: "exact", 1: "predicted", 200: "predicted", 201: "held", 500: "held", 501: "none"}
+    assert [tracker.at(last + ms * MS).label for ms in after] == list(after.values())
+
+
+def test_lost_eyes_stand_still_from_400_ms_after_their_last_sample() -> None:
+    tracker, last = fed(60, moving, hold_s=2.0)
+    tracker.update(None, capture_ns=last + 300 * MS)
+    tracker.update(None, capture_ns=last + 350 * MS)  # the first word of a loss counts
+    y_m = [tracker.at(last + ms * MS).eyes_m[0, 1] - moving(59)[0, 1] for ms in (300, 350, 390, 400, 410, 2000)]
+    assert y_m == sorted(y_m)
+    np.testing.assert_allclose(y_m[:2], [0.09, 0.1033], atol=1e-3)
+    assert y_m[2] < y_m[3] == y_m[4] == y_m[5]
+
+
+def test_the_newest_256_samples_are_remembered() -> None:
+    tracker, last = fed(300)
+    assert tracker.at(last - 255 * PERIOD).label == "exact"
+    assert tracker.at(last - 256 * PERIOD).label == tracker.at(last - 255 * PERIOD - 1).label == "none"
 
 
 @given(ms=st.integers(-2000, 2000))
@@ -112,10 +134,12 @@ def test_duplicates_and_late_samples_are_passed_over() -> None:
     np.testing.assert_array_equal(tracker.at(last + 50 * MS).eyes_m, before)
 
 
-def test_a_clock_that_was_set_back_begins_anew() -> None:
-    tracker, last = fed()
-    tracker.update(points(), capture_ns=last - 5 * 10**9)
-    assert tracker.at(last - 5 * 10**9).label == "exact"
+@pytest.mark.parametrize(("back_ns", "why"), [(999_999_999, NOT_NEWER), (10**9, ""), (2 * 10**9, "")])
+def test_a_clock_that_was_set_back_by_a_second_begins_anew(back_ns: int, why: str) -> None:
+    tracker, last = fed(100)
+    assert tracker.update(points(), capture_ns=last - back_ns) == why
+    assert tracker.seen_ns == (last if why else last - back_ns)
+    assert tracker.is_established == bool(why)
 
 
 @pytest.mark.parametrize(
@@ -148,8 +172,89 @@ def test_a_hasty_head_is_followed_at_its_second_sample() -> None:
     assert told[-1] == ""
     tracker, last = fed()
     told = [tracker.update(points(far), capture_ns=last + k * PERIOD) for k in range(1, 17)]
-    assert told == [ELSEWHERE] * 15 + [""]
+    assert told == [ELSEWHERE] * 15 + [""] and tracker.replaced == 1
     np.testing.assert_allclose(tracker.at(last + 16 * PERIOD + 20 * MS).eyes_m, far, atol=1e-9)  # and immediately
+
+
+@pytest.mark.parametrize(
+    ("gap_ms", "near_m", "far_m"), [(33.333, 0.030, 0.035), (100, 0.162, 0.170), (200, 0.412, 0.423)]
+)
+def test_a_head_s_reach_is_30_m_s2_up_to_2_m_s(gap_ms: float, near_m: float, far_m: float) -> None:
+    for y_m, second in ((near_m, ""), (far_m, ELSEWHERE)):
+        tracker, last = fed(covariance_m2=FINE_M2)
+        begin = last + round(gap_ms * MS)
+        told = [tracker.update(aside(y_m, covariance_m2=FINE_M2), capture_ns=begin + k * PERIOD) for k in (0, 1)]
+        assert told == [ELSEWHERE, second] and tracker.replaced == 0
+
+
+@pytest.mark.parametrize(("hold_s", "after_ms"), [(0.2, 200), (1.0, 500)])
+def test_another_person_is_followed_after_half_a_second_or_the_hold(hold_s: float, after_ms: int) -> None:
+    for ms, why in ((after_ms, ELSEWHERE), (after_ms + 1, "")):
+        tracker, last = fed(hold_s=hold_s)
+        assert tracker.update(aside(3.0), capture_ns=last + ms * MS) == why
+        assert tracker.replaced == (why == "") and tracker.is_established == bool(why)
+        assert tracker.seen_ns == (last if why else last + ms * MS)
+
+
+@pytest.mark.parametrize(("seen_first", "why"), [(False, ""), (True, ELSEWHERE)])
+def test_a_sample_that_another_person_fits_better_is_theirs(seen_first: bool, why: str) -> None:
+    tracker, last = fed(covariance_m2=FINE_M2)
+    if seen_first:  # too soon for the viewer to have gone there
+        assert tracker.update(aside(0.29, covariance_m2=FINE_M2), capture_ns=last + 10 * MS) == ELSEWHERE
+    assert tracker.update(aside(0.24, covariance_m2=FINE_M2), capture_ns=last + 350 * MS) == why
+
+
+@pytest.mark.parametrize("near_m", [0.15, 0.2])
+def test_a_sample_that_certainly_is_the_viewer_s_is_theirs(near_m: float) -> None:
+    tracker, last = fed(covariance_m2=FINE_M2)
+    assert tracker.update(aside(0.29, covariance_m2=FINE_M2), capture_ns=last + 10 * MS) == ELSEWHERE
+    assert tracker.update(aside(near_m, covariance_m2=FINE_M2), capture_ns=last + 350 * MS) == ""
+
+
+@pytest.mark.parametrize(("y_m", "third"), [(0.20, ""), (0.162, ""), (0.155, ELSEWHERE)])
+def test_a_doubtful_sample_is_undone_by_the_next_two(y_m: float, third: str) -> None:
+    tracker, last = fed(covariance_m2=FINE_M2)
+    back = last + 300 * MS
+    path = ((0, y_m), (1, 0.0), (2, 0.0))
+    told = [tracker.update(aside(y, covariance_m2=FINE_M2), capture_ns=back + k * PERIOD) for k, y in path]
+    assert told == ["", ELSEWHERE, third]
+    assert tracker.at(back).label == ("exact" if third else "interpolated")  # its sample is gone
+    if not third:
+        np.testing.assert_allclose(tracker.at(back + 2 * PERIOD + 100 * MS).eyes_m, STILL, atol=1e-6)
+
+
+def test_a_head_is_established_with_its_third_sample() -> None:
+    tracker = Tracker()
+    assert tracker.seen_ns is None and not tracker.is_established
+    for ms, is_established in ((100, False), (133, False), (166, True)):
+        tracker.update(points(), capture_ns=ms * MS)
+        assert tracker.seen_ns == ms * MS and tracker.is_established is is_established
+
+
+@pytest.mark.parametrize(
+    ("samples", "age_ms", "reach_m"),
+    [
+        *((30, age_ms, None) for age_ms in (-100, 0, 251)),
+        *((30, age_ms, reach_m) for age_ms, reach_m in ((10, 0.0166), (100, 0.0661), (200, 0.2161), (250, 0.3286))),
+        *((2, age_ms, reach_m) for age_ms, reach_m in ((0, None), (10, 0.0370), (100, 0.2170), (250, 0.5170))),
+    ],
+)
+def test_people_are_recognised_within_their_reach(samples: int, age_ms: int, reach_m: float | None) -> None:
+    """At 10 m/s² once established, else at 2 m/s, and with the noise; for a quarter of a second."""
+    tracker, last = fed(samples, covariance_m2=FINE_M2)
+    found = tracker.reach_m(aside(0.005, covariance_m2=FINE_M2), capture_ns=last + age_ms * MS)
+    assert found == (None if reach_m is None else (pytest.approx(0.005), pytest.approx(reach_m, abs=2e-4)))
+    assert Tracker().reach_m(points(), capture_ns=last) is None
+
+
+@pytest.mark.parametrize(("off_m", "is_same"), [(0.01, True), (0.025, False), (0.07, False)])
+def test_a_head_that_breaks_with_its_motion_is_not_recognised(off_m: float, is_same: bool) -> None:
+    tracker, last = fed(60, moving, covariance_m2=FINE_M2)
+    for forth in (-off_m, off_m):
+        eyes = moving(59 + 3) + np.array([0.0, forth, 0.0])
+        found = tracker.reach_m(points(eyes, covariance_m2=FINE_M2), capture_ns=last + 3 * PERIOD)
+        assert (found is not None) is is_same
+        assert found is None or found[0] == pytest.approx(off_m, abs=1e-4)
 
 
 @given(
@@ -210,6 +315,46 @@ def test_a_covariance_that_is_none_breaks_nothing(covariance_m2: NDArray[np.floa
     np.testing.assert_allclose(tracker.at(last + 50 * MS).eyes_m, STILL, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("told", "used"),
+    [
+        (np.diag([1e-6, 1e-6, 1e-14]), np.diag([1e-6, 1e-6, 4e-10])),
+        (np.diag([1e-14, 1e-6, 1e-6]), np.diag([4e-10, 1e-6, 1e-6])),
+        (np.diag([1e-6, 1e-14, 1e-6]), np.diag([1e-6, 4e-10, 1e-6])),
+        (np.diag([1e-6, 3.9e-10, 1e-6]), np.diag([1e-6, 4e-10, 1e-6])),
+        (np.diag([4e-6, 2e-6, 1e-6]) + np.eye(3)[[1, 0, 2]] * [3e-6, 3e-6, 0], None),
+        (np.diag([4e-6, 1e-6, 2e-6]) + np.eye(3)[[2, 1, 0]] * [3e-6, 0, 3e-6], None),
+        (np.diag([1e-6, 4e-6, 2e-6]) + np.eye(3)[[0, 2, 1]] * [0, 3e-6, 3e-6], None),
+        (np.full((3, 3), 1e-6) + np.diag([1e-6, 1e-6, 1e-6]), None),
+        (np.full((3, 3), -1e-6) + np.diag([2.5e-6, 2.5e-6, 2.5e-6]), None),
+        (
+            np.array([[1e-6, 8e-7, 0], [0, 1e-6, 0], [0, 0, 1e-6]]),
+            np.eye(3) * 1e-6 + np.eye(3)[[1, 0, 2]] * [4e-7, 4e-7, 0],
+        ),
+    ],
+)
+def test_a_driver_s_noise_is_raised_to_20_micrometres_in_every_direction(
+    told: NDArray[np.float64], used: NDArray[np.float64] | None
+) -> None:
+    if used is None:
+        variances, axes = np.linalg.eigh(told)
+        used = axes @ np.diag(np.maximum(variances, 4e-10)) @ axes.T
+    path = [np.multiply([0.002, -0.003, 0.001], np.sin([k, 2 * k, 3 * k])) for k in range(12)]
+    answers = []
+    for covariance_m2 in (told, used):
+        tracker, last = fed(12, lambda k: STILL + path[k], covariance_m2=covariance_m2)
+        answers.append(tracker.at(last + 50 * MS))
+    np.testing.assert_allclose(answers[0].eyes_m, answers[1].eyes_m, rtol=0, atol=1e-9)
+    assert answers[0].sigma_m == pytest.approx(answers[1].sigma_m, rel=1e-6)
+
+
+def test_one_sample_s_sigma_is_its_own_noise_and_an_unknown_speed() -> None:
+    """An eye has twice the midpoint's variance, and a new head moves at 0.3 m/s or turns at a third of that."""
+    tracker, last = fed(1, covariance_m2=FINE_M2)
+    told = [tracker.at(last + ms * MS).sigma_m for ms in (0, 33, 66)]
+    np.testing.assert_allclose(told, [0.001444, 0.01077, 0.02151], rtol=2e-3)
+
+
 def test_sigma_grows_while_the_head_is_not_seen() -> None:
     tracker, last = fed(count=60, motion=moving)
     sigmas = [tracker.at(last + ms * MS).sigma_m for ms in (10, 60, 120, 250, 400)]
@@ -225,7 +370,59 @@ def test_depth_counts_by_its_lever() -> None:
     assert sideways_sigma_m(depth, eye_m, panel_m=(0.5184, 0.2916)) == pytest.approx(expected, rel=0.01)
 
 
+@pytest.mark.parametrize("eye_m", [(0.6, 0.3, 0.2), (0.6, -0.3, 0.1), (0.5, 0.0, -0.4)])
+def test_an_error_along_the_line_of_sight_counts_as_depth(eye_m: tuple[float, float, float]) -> None:
+    """The display's centre does not see it, wherever the eye is, and its other points see the depth."""
+    along_m = 0.001 * np.array(eye_m) / eye_m[0]
+    on_axis = sideways_sigma_m(np.diag([1e-6, 0, 0]), np.array([eye_m[0], 0, 0]), panel_m=(0.5, 0.3))
+    told = sideways_sigma_m(np.outer(along_m, along_m), np.array(eye_m), panel_m=(0.5, 0.3))
+    assert told == pytest.approx(on_axis) == pytest.approx(1e-3 * np.sqrt((0.25 + 0.09) / 24) / eye_m[0])
+
+
+@pytest.mark.parametrize(
+    ("error_m2", "eye_m", "expected_m"),
+    [
+        (np.diag([0, 4e-6, 0]), (0.6, 0.3, 0.2), 0.001414),
+        (np.diag([0, 0, 4e-6]), (0.6, 0.3, 0.2), 0.001414),
+        (np.diag([0, 4e-6, 4e-6]), (3.0, 0, 0), 0.002),
+        (np.diag([1e-6, 0, 0]), (0.6, 0.3, 0.2), 0.000469),
+        (np.diag([1e-6, 0, 0]), (0.1, 0, 0), 0.00119),
+        (np.diag([1e-6, 0, 0]), (0.05, 0, 0), 0.00119),
+        (-np.eye(3), (0.6, 0, 0), 0.0),
+    ],
+)
+def test_sideways_errors_count_fully_per_axis(
+    error_m2: NDArray[np.float64], eye_m: tuple[float, float, float], expected_m: float
+) -> None:
+    told = sideways_sigma_m(error_m2, np.array(eye_m), panel_m=(0.5, 0.3))
+    assert told == pytest.approx(expected_m, rel=2e-3)
+
+
 # --- loss and return
+
+
+@pytest.mark.parametrize(("gap_ms", "goes_on_m"), [(380, 0.03), (420, 0.0)])
+def test_a_motion_is_known_for_400_ms(gap_ms: int, goes_on_m: float) -> None:
+    tracker, last = fed(60, moving, covariance_m2=FINE_M2)
+    tracker.update(None, capture_ns=last + PERIOD)
+    again = moving(59 + gap_ms * MS / PERIOD)
+    assert tracker.update(points(again, covariance_m2=FINE_M2), capture_ns=last + gap_ms * MS) == ""
+    assert tracker.at(last + (gap_ms + 100) * MS).eyes_m[0, 1] - again[0, 1] == pytest.approx(goes_on_m, abs=2e-4)
+
+
+@pytest.mark.parametrize("ahead_ms", [0, 20])
+def test_found_eyes_blend_within_60_ms_of_what_was_shown(ahead_ms: int) -> None:
+    """From the latest time shown on; what was only looked up, without a picture, does not count."""
+    tracker, last = fed(covariance_m2=FINE_M2)
+    tracker.update(None, capture_ns=last + PERIOD)
+    back = last + 150 * MS
+    tracker.at(back + ahead_ms * MS)
+    tracker.ahead(back + 50 * MS)
+    assert tracker.update(aside(0.08, covariance_m2=FINE_M2), capture_ns=back) == ""
+    shown = [tracker.at(back + (ahead_ms + ms) * MS) for ms in (0, 15, 30, 45, 60, 100)]
+    assert {answer.label for answer in shown[1:]} == {"predicted"}
+    off_m = [answer.eyes_m[1, 1] - STILL[1, 1] for answer in shown]
+    np.testing.assert_allclose(off_m, [0.0, 0.0125, 0.04, 0.0675, 0.08, 0.08], atol=1e-6)
 
 
 @pytest.mark.parametrize("lost_s", [0.15, 0.3, 0.4])

@@ -27,7 +27,11 @@ PLACES: list[tuple[str, int, dict[float, Place]]] = [
     ("two-exchange", 1, {4.0: RIGHT, 5.0: (0.99, 0.0, 0.0), 6.0: LEFT, 10.0: LEFT, 12.0: RIGHT}),
     ("two-leave", 0, {0.0: LEFT, 5.0: LEFT, 10.6: LEFT}),
     ("two-leave", 1, {0.0: RIGHT, 4.0: RIGHT, 4.5: (0.81, 0.32, 0.175), 5.0: STANDING, 5.4: WALKING_OFF, 6.6: AWAY}),
-    ("two-leave", 1, {8.0: AWAY, 9.2: WALKING_OFF, 9.6: STANDING, 10.1: (0.81, 0.32, 0.175), 10.6: RIGHT, 900.0: RIGHT}),
+    (
+        "two-leave",
+        1,
+        {8.0: AWAY, 9.2: WALKING_OFF, 9.6: STANDING, 10.1: (0.81, 0.32, 0.175), 10.6: RIGHT, 900.0: RIGHT},
+    ),
     ("two-sit", 0, {0.0: LEFT, 3.6: LEFT, 4.6: LEFT}),
     ("two-sit", 1, {0.0: AWAY, 2.0: AWAY, 3.2: WALKING_OFF, 3.6: STANDING, 4.1: (0.81, 0.32, 0.175), 4.6: RIGHT}),
 ]
@@ -67,7 +71,7 @@ def test_the_sensor_sees_35_degrees_to_either_side() -> None:
 @pytest.mark.parametrize(("aside_m", "is_hidden"), [(0.19, False), (0.17, True), (-0.17, True), (-0.19, False)])
 @pytest.mark.parametrize("axis", [1, 2])
 def test_a_head_hides_what_is_behind_its_width(aside_m: float, axis: int, is_hidden: bool) -> None:
-    near, far = np.tile(SENSOR + [0.5, 0.0, 0.0], (2, 1)), np.tile(SENSOR + [1.25, 0.0, 0.0], (2, 1))
+    near, far = (np.tile(SENSOR + np.array([x_m, 0.0, 0.0]), (2, 1)) for x_m in (0.5, 1.25))
     far[:, axis] += aside_m
     gone = np.full((2, 3), np.nan)
     eyes = np.stack([np.vstack(pair) for pair in ((near, far), (far, near), (near, gone), (gone, far))])
