@@ -9,20 +9,24 @@ from hypothesis import strategies as st
 
 from runtime.clock import NS_PER_S
 from runtime.eyes.association import assigned
-from runtime.eyes.people import People
-from runtime.eyes.tracker import Tracker
+from runtime.eyes.people import CROWD, ONE_HEAD, People
+from runtime.eyes.plausibility import BEHIND, MILLIMETRES, NOT_NEWER
+from runtime.eyes.rest import RestWatch
+from runtime.eyes.tracker import ELSEWHERE, UNCERTAIN, Tracker
 from runtime.eyes.two_people import MOTIONS_OF_TWO, observe_two
 from runtime.records import F64, EyePoints, SensorFrame
 
 RATE_HZ = 30
+MS = 1_000_000
 
 
 def people(*, most_served: int = 2, join_s: float = 1.0) -> People:
     return People(Tracker, lambda: None, most_served=most_served, join_s=join_s, in_front_m=0.07)
 
 
-def head(*place_m: float) -> EyePoints:
-    return EyePoints(np.array([place_m]) + np.array([[0, -0.0315, 0], [0, 0.0315, 0]]), np.ones(2))
+def head(*place_m: float, confidence: float = 1.0, apart_m: float = 0.063) -> EyePoints:
+    eyes_m = np.array([place_m]) + apart_m / 2 * np.array([[0, -1, 0], [0, 1, 0]])
+    return EyePoints(eyes_m, np.array([1.0, confidence]))
 
 
 def fed(crowd: People, *heads: EyePoints, seconds: float, begin_s: float = 0.0) -> list[list[int]]:
@@ -136,3 +140,115 @@ def test_two_samples_of_one_face_are_one_person() -> None:
     crowd = people(join_s=0.1)
     twice = head(0.6, -0.2, 0.0), head(0.64, -0.18, 0.0)
     assert fed(crowd, *twice, seconds=1.0)[-1] == [1] and crowd.in_view == 1
+
+
+A, B = head(0.6, -0.2, 0.0), head(0.8, 0.3, 0.0)
+
+
+@pytest.mark.parametrize(("lost_s", "away_m"), [(0.3, 0.1), (0.3, 0.75), (0.4, 0.95)])
+def test_somebody_hidden_comes_back_anew_and_keeps_the_place(lost_s: float, away_m: float) -> None:
+    crowd = people(join_s=0.2)
+    fed(crowd, A, B, seconds=1.0)
+    assert fed(crowd, A, seconds=lost_s, begin_s=1.0)[-1] == [1, 2]
+    served = fed(crowd, A, head(0.8, 0.3 + away_m, 0.0), seconds=0.15, begin_s=1.0 + lost_s)
+    assert served[:4] == [[1, 2], [1, 2], [1, 3], [1, 3]] and crowd.in_view == 2
+
+
+def test_somebody_who_cannot_have_come_from_there_takes_no_place() -> None:
+    crowd = people(join_s=0.2)
+    fed(crowd, A, B, seconds=1.0)
+    fed(crowd, A, seconds=0.3, begin_s=1.0)
+    served = fed(crowd, A, head(0.8, 1.13, 0.0), seconds=1.0, begin_s=1.3)
+    assert served[3] == [1, 2] and served[-1] == [1, 3]
+    assert served.index([1, 3]) == 6  # once the second is lost, half a second after being last seen
+
+
+def test_somebody_hidden_for_a_moment_has_waited_all_the_same() -> None:
+    crowd = people(join_s=1.0)
+    fed(crowd, A, B, seconds=0.6)
+    fed(crowd, A, seconds=0.3, begin_s=0.6)
+    served = fed(crowd, A, head(0.8, 0.4, 0.0), seconds=0.5, begin_s=0.9)
+    assert served.index([1, 3]) == pytest.approx(3, abs=1)
+
+
+@pytest.mark.parametrize(("speed_m_s", "is_served"), [(0.45, True), (0.55, False), (-0.45, True), (-0.55, False)])
+def test_whoever_walks_past_faster_than_half_a_metre_a_second_waits(speed_m_s: float, is_served: bool) -> None:
+    crowd = people(join_s=0.5)
+    for n in range(40):
+        walker = head(1.2, 0.3 + speed_m_s * n / RATE_HZ, 0.4)
+        crowd.update((head(0.6, -0.2, 0.0), walker), capture_ns=n * NS_PER_S // RATE_HZ)
+    assert [person.number for person in crowd.served] == ([1, 2] if is_served else [1])
+    assert crowd.in_view == 2
+
+
+def test_each_refused_head_has_its_reason() -> None:
+    good = [head(0.6, -1.2 + 0.4 * n, 0.0) for n in range(7)]
+    bad = {
+        UNCERTAIN: head(0.6, 0.9, 0.5, confidence=0.29),
+        BEHIND: head(0.069, 0.2, 0.5),
+        MILLIMETRES: head(600.0, 0.0, 500.0, apart_m=63.0),
+        ONE_HEAD: head(0.6, -1.2 + 0.119, 0.0),
+    }
+    order = [good[0], *bad.values(), *good[1:]]
+    assert people().update(order, capture_ns=1) == ["", *bad, *[""] * 5, CROWD]
+    assert people().update((head(0.071, 0.2, 0.5, confidence=0.31), good[0]), capture_ns=1) == ["", ""]
+    near_one_refused = head(0.6, 0.95, 0.5)
+    assert people().update((bad[UNCERTAIN], near_one_refused), capture_ns=1) == [UNCERTAIN, ""]
+    assert people().update((good[0], head(0.6, -1.2 + 0.121, 0.0)), capture_ns=1) == ["", ""]
+
+
+def test_old_samples_are_refused_until_the_clock_was_set_back() -> None:
+    crowd = people()
+    assert fed(crowd, A, B, seconds=3.0)[-1] == [1, 2]
+    newest_ns = round((3.0 - 1 / RATE_HZ) * NS_PER_S) + 1
+    for capture_ns in (newest_ns, newest_ns - NS_PER_S + 1):
+        assert crowd.update((A, B), capture_ns=capture_ns) == [NOT_NEWER] * 2
+    assert crowd.update((A, B), capture_ns=newest_ns - NS_PER_S) == ["", ""]
+    assert [person.number for person in crowd.served] == [3] and crowd.in_view == 1
+
+
+@pytest.mark.parametrize(("unseen_ms", "label"), [(100, "predicted"), (101, "held")])
+def test_who_is_missing_for_a_tenth_of_a_second_is_lost(unseen_ms: int, label: str) -> None:
+    crowd = people(join_s=0.0)
+    for n in range(8):
+        crowd.update((A, B), capture_ns=n * 30 * MS)
+    for ms in (50, unseen_ms):
+        crowd.update((A,), capture_ns=(210 + ms) * MS)
+    now_ns = (211 + unseen_ms) * MS
+    assert [person.tracker.at(now_ns).label for person in crowd.served] == ["predicted", label]
+    crowd.update((), capture_ns=now_ns)  # nobody is seen: all are lost
+    assert [person.tracker.at(now_ns + 1).label for person in crowd.served] == ["held", "held"]
+
+
+@pytest.mark.parametrize(("alone_s", "why"), [(10.3, ""), (10.8, ELSEWHERE)])
+def test_heads_are_told_apart_for_ten_seconds_after_several(alone_s: float, why: str) -> None:
+    """The second person counts for the half second in which they are lost."""
+    crowd = people()
+    fed(crowd, A, B, seconds=0.2)
+    fed(crowd, A, seconds=alone_s, begin_s=0.2)
+    assert crowd.update((head(0.8, 1.5, 0.0),), capture_ns=round((0.25 + alone_s) * NS_PER_S)) == [why]
+
+
+def test_another_lone_viewer_has_another_number() -> None:
+    crowd = people()
+    assert fed(crowd, A, seconds=1.0)[-1] == [1] and crowd.in_view == 1
+    served = fed(crowd, head(0.9, 1.5, 0.0), seconds=1.0, begin_s=1.0)
+    assert served[0] == [1] and served[-1] == [2] and crowd.in_view == 1
+
+
+def test_the_nearest_who_waits_long_enough_is_taken_next() -> None:
+    crowd = people(join_s=0.5)
+    far, near = head(1.2, 0.0, 0.0), head(0.9, 0.6, 0.0)
+    assert fed(crowd, A, far, near, seconds=0.8)[-1] == [1, 3]
+
+
+@pytest.mark.parametrize("heads", [(A,), (A, B)])
+def test_each_person_s_rest_is_watched(heads: tuple[EyePoints, ...]) -> None:
+    crowd = People(Tracker, lambda: RestWatch(max_drift_m=0.001), most_served=2, join_s=0.1, in_front_m=0.07)
+    fed(crowd, *heads, seconds=1.3)
+    rests = [person.rest for person in crowd.served]
+    for one, rest in zip(heads, rests, strict=True):
+        assert rest is not None and rest.place is not None
+        np.testing.assert_allclose(rest.place, one.eyes_m, atol=1e-9)
+    crowd.renew_rest()
+    assert [person.rest is not None and person.rest.place is None for person in crowd.served] == [True] * len(heads)
