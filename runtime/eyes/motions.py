@@ -60,7 +60,7 @@ def _nod(times_s: F64) -> tuple[F64, F64]:
 
 
 def _walk(times_s: F64) -> tuple[F64, F64]:
-    """Walk back and forth over 2.4 m in front of the display, at up to 1 m/s with 1.9 steps a second."""
+    """Walk back and forth over 2 m in front of the display, at up to 1.1 m/s with 1.9 steps a second."""
     knots = np.arange(0.0, times_s.max() + 4.0, 3.5)
     side = minimum_jerk(times_s, knots_s=knots, values=np.where(np.arange(len(knots)) % 2, 1.0, -1.0))
     bob = 0.02 * np.sin(2 * np.pi * 1.9 * times_s)

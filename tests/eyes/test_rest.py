@@ -79,15 +79,73 @@ def test_slow_drift_is_bounded(noise_mm: float) -> None:
     assert max(off) < 2 * MOST_M + 3 * noise_mm / 1000
 
 
-def test_what_is_lost_is_no_rest() -> None:
-    watch = RestWatch(max_drift_m=MOST_M)
-    for number in range(60):
-        watch.update(EYES, capture_ns=number * NS_PER_S // 30)
+def rested(eyes: np.ndarray = EYES, *, count: int = 60, noise_m: float = 0.0) -> RestWatch:
+    watch, random = RestWatch(max_drift_m=MOST_M), np.random.default_rng(0)
+    for number in range(count):
+        watch.update(eyes + random.normal(0.0, noise_m, (2, 3)), capture_ns=number * NS_PER_S // 30)
     assert watch.place is not None
-    watch.update(EYES, capture_ns=10 * NS_PER_S)  # after a gap
-    assert watch.place is None
-    watch.update(EYES, capture_ns=NS_PER_S)  # a clock that was set back
-    assert watch.place is None
+    return watch
+
+
+NEWEST_NS = 59 * NS_PER_S // 30
+
+
+@pytest.mark.parametrize(
+    ("capture_ns", "rests"),
+    [
+        (NEWEST_NS + 1, True),
+        (NEWEST_NS + NS_PER_S - 1, True),
+        (NEWEST_NS + NS_PER_S, False),
+        (NEWEST_NS, False),
+        (NEWEST_NS - NS_PER_S, False),
+    ],
+)
+def test_a_gap_or_a_clock_that_was_set_back_ends_rest(capture_ns: int, rests: bool) -> None:
+    watch = rested()
+    watch.update(EYES, capture_ns=capture_ns)
+    assert (watch.place is not None) is rests
+    for number in range(1, 31):
+        watch.update(EYES, capture_ns=capture_ns + number * NS_PER_S // 30)
+        assert (watch.place is not None) is (rests or number == 30)  # a second later
+
+
+ASIDE = np.array([[0.6, 0.269, 0.2], [0.6, 0.331, 0.2]])
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(
+    ("eyes", "step_mm", "leaves"),
+    [
+        (EYES, (0.0, 0.29, 0.0), False),
+        (EYES, (0.0, 0.31, 0.0), True),
+        (EYES, (0.0, 0.0, 0.29), False),
+        (EYES, (0.0, 0.0, 0.31), True),
+        (EYES * [1, 1, 0], (1.15, 0.0, 0.0), False),  # a quarter of it is seen at the display's edges
+        (EYES * [1, 1, 0], (1.25, 0.0, 0.0), True),
+        (EYES * [0.1, 1, 0], (0.25, 0.0, 0.0), True),
+        (ASIDE, (1.0, 0.5, 0.333), False),  # towards the display's centre
+        (ASIDE, (1.0, 0.0, 0.333), True),
+        (ASIDE, (1.0, 0.5, 0.0), True),
+    ],
+)
+def test_a_head_has_left_at_its_second_sample_seen_elsewhere(
+    eyes: np.ndarray, step_mm: tuple[float, float, float], leaves: bool, sign: float
+) -> None:
+    watch, place = rested(eyes), eyes + sign * np.array(step_mm) / 1000
+    rests = []
+    for number in range(60, 95):
+        watch.update(place, capture_ns=number * NS_PER_S // 30)
+        rests.append(watch.place is not None)
+    assert rests == ([True, *[False] * 29, *[True] * 5] if leaves else [True] * 35)
+
+
+@pytest.mark.parametrize(("noise_mm", "noise_high_mm", "sigma_mm"), [(0, 0, 0.71), (1, 1.17, 1.44), (3, 3.5, 2.95)])
+def test_sigma_covers_noise_and_the_drift_that_is_not_detected(
+    noise_mm: float, noise_high_mm: float, sigma_mm: float
+) -> None:
+    watch = rested(noise_m=noise_mm / 1000)
+    assert watch.sigma_m * 1000 == pytest.approx(sigma_mm, abs=0.02)
+    np.testing.assert_allclose(watch.noise_m * 1000, [0.32 * noise_high_mm, *[noise_high_mm] * 2], rtol=0.05)
 
 
 def test_a_head_that_leans_in_on_the_axis_is_seen_to_leave() -> None:
@@ -98,8 +156,9 @@ def test_a_head_that_leans_in_on_the_axis_is_seen_to_leave() -> None:
         assert watch.place is None or closer[0] < 0.015
 
 
-def test_what_scatters_more_than_any_sensor_s_noise_never_rests() -> None:
-    assert all(place is None for _, _, place in watched(20, noise_m=0.02))
+@pytest.mark.parametrize("noise_m", [0.006, 0.02])
+def test_what_scatters_more_than_any_sensor_s_noise_never_rests(noise_m: float) -> None:
+    assert all(place is None for _, _, place in watched(20, noise_m=noise_m))
 
 
 @given(x_m=st.floats(-0.01, 0.01), y_m=st.floats(-0.001, 0.001))

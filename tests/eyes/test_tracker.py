@@ -348,6 +348,15 @@ def test_a_driver_s_noise_is_raised_to_20_micrometres_in_every_direction(
     assert answers[0].sigma_m == pytest.approx(answers[1].sigma_m, rel=1e-6)
 
 
+def test_noise_is_measured_where_the_driver_reports_none() -> None:
+    sigmas = [tracker.at(last).sigma_m for tracker, last in (fed(15), fed(25), fed(60, covariance_m2=5e-9 * np.eye(3)))]
+    assert sigmas[1] < 0.3 * sigmas[0] and sigmas[2] < 0.3 * sigmas[0]
+    wild, last = fed(15)
+    for k in range(1, 15):  # of samples that are accepted
+        assert wild.update(aside(0.3 + 0.01 * k), capture_ns=last + k * PERIOD // 8) == ELSEWHERE
+    assert wild.at(last).sigma_m == sigmas[0]
+
+
 def test_one_sample_s_sigma_is_its_own_noise_and_an_unknown_speed() -> None:
     """An eye has twice the midpoint's variance, and a new head moves at 0.3 m/s or turns at a third of that."""
     tracker, last = fed(1, covariance_m2=FINE_M2)
