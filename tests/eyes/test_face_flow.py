@@ -38,7 +38,7 @@ def moved(before: U8, after: U8, mesh: F64, guess: F64, *, eye_distance: float) 
 
 @pytest.mark.parametrize("distance_m", [0.4, 1.0])
 @pytest.mark.parametrize(("shift_px", "turn_deg", "scale"), [((3.3, -1.7), 0.0, 1.0), ((-2.0, 4.5), 4.0, 1.04)])
-def test_a_face_s_movement_is_measured_to_half_a_percent_of_the_eye_separation(
+def test_a_face_s_movement_is_measured_precisely(
     distance_m: float, shift_px: tuple[float, float], turn_deg: float, scale: float
 ) -> None:
     """The guess of the face's new place is off by two pixels."""

@@ -48,7 +48,7 @@ def test_seeds_give_paths_of_similar_pace_and_size_to_both_sides() -> None:
     assert {path.side for path in paths} == {-1.0, 1.0}
 
 
-def test_a_wrong_sample_is_off_by_4_to_20_cm_in_either_eye_or_both() -> None:
+def test_a_wrong_sample_is_off_in_either_eye_or_both() -> None:
     observed = observe("lean", seconds=40.0, rate_hz=30.0, noise_m=0.0, outliers=0.5, dropout_every_s=0.0)
     eyes = np.array([one.points.eyes_m for one in observed if one.points is not None])
     off_m = eyes - true_eyes("lean", np.arange(1200) / 30)

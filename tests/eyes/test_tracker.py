@@ -179,7 +179,8 @@ def test_a_hasty_head_is_followed_at_its_second_sample() -> None:
 @pytest.mark.parametrize(
     ("gap_ms", "near_m", "far_m"), [(33.333, 0.030, 0.035), (100, 0.162, 0.170), (200, 0.412, 0.423)]
 )
-def test_a_head_s_reach_is_30_m_s2_up_to_2_m_s(gap_ms: float, near_m: float, far_m: float) -> None:
+def test_a_viewer_s_second_sample_counts_within_reach(gap_ms: float, near_m: float, far_m: float) -> None:
+    """At 30 m/s² up to 2 m/s, and with the noise."""
     for y_m, second in ((near_m, ""), (far_m, ELSEWHERE)):
         tracker, last = fed(covariance_m2=FINE_M2)
         begin = last + round(gap_ms * MS)
