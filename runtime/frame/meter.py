@@ -153,9 +153,7 @@ def _moved_grid(pictures: Sequence[U8], job: Job, eyes_m: Eyes) -> list[F32]:
     """Sample pictures at half size (`_halved`) on the coarse grid, as the panels would show them to the moved eyes."""
     stack = job.stack
     old_m = job.eyes_m.mean(axis=0)
-    shared = len(eyes_m) > 2
-    new_m = old_m + common_movement_m(job.eyes_m, eyes_m) if shared else eyes_m.mean(axis=0)
-    moved = parallax(stack, old_m=old_m, new_m=new_m)
+    moved = parallax(stack, old_m=old_m, new_m=old_m + common_movement_m(job.eyes_m, eyes_m))
     if moved is None or job.relief is None:
         return [_grid(picture) for picture in pictures]
     rows, columns = _grid_lines(pictures[0])

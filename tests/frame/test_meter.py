@@ -43,6 +43,19 @@ def test_the_residual_is_the_error_of_the_light_at_pinhole_eyes(stack: PanelStac
     assert found == pytest.approx(expected, rel=0.05)
 
 
+def test_rays_cover_their_whole_pixel_and_no_more() -> None:
+    """Of two pixels, one is clear and bright, and the other half clear and grey, on the middle panel alone."""
+    layers, picture = np.full((3, 54, 96, 4), 255, np.uint8), np.full((27, 48, 3), 255, np.uint8)
+    layers[1, :, 3::4, :3], picture[:, 1::2] = 0, 128
+    plane_from_picture = np.linalg.inv(STACK.panel(1).raster_from_plane()) @ np.diag([2.0, 2.0, 1.0])
+    for turned in (False, True):
+        if turned:
+            layers[1, ..., :3], picture[:] = 255, 255
+            layers[1, 3::4, :, :3], picture[1::2] = 0, 128
+        job = Job(Targets(STACK, EYES, (TargetView(picture, plane_from_picture),) * 2))
+        assert sampled_light(layers, job, np.random.default_rng(3).random((2, 4_000, 2)), boxes=True) < 0.02
+
+
 def test_a_coarse_solution_is_interpolated() -> None:
     """Otherwise, its pixels would be visible as squares."""
     layers, pictures = smooth(3, 54, 96, seed=1), smooth(2, 54, 96, seed=2)
