@@ -201,11 +201,11 @@ class SimulatedSolver(SolverHost):
         if solution is not None and solution.effort is not None:
             effort = solution.effort
             stages = dict(costs.stages[effort.reduction])
-            stages["step"] = stages.get("step", 0.0) * (effort.steps - (effort.continued_from or 0))
+            stages["step"] *= effort.steps - (effort.continued_from or 0)
             if effort.continued_from is not None:
                 stages |= dict.fromkeys(("render", "prepare", "inference"), 0.0)
             return replace(step, solution=replace(solution, stage_ms=stages)), round(costs.ms(effort) * NS_PER_MS)
         if flat is not None:
-            render_ms = costs.stages[1].get("render", 0.0)
+            render_ms = costs.stages[1]["render"]
             return replace(step, flat=replace(flat, stage_ms={"render": render_ms})), round(render_ms * NS_PER_MS)
         return step, 0

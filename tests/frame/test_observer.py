@@ -18,7 +18,7 @@ from runtime.config import Settings
 from runtime.content.base import ContentInfo, ContentSource, View
 from runtime.evaluation.displayed import displayed
 from runtime.evaluation.refresh_quality import RefreshTargets
-from runtime.frame import refresh_lines, sampling
+from runtime.frame import sampling
 from runtime.frame.measuring import Comparison, MeasuringProcess
 from runtime.frame.messages import Draw, Facts, Order
 from runtime.frame.observer import RunObserver
@@ -179,14 +179,14 @@ def test_what_the_recording_never_said_is_null_and_holds_nothing_up(content: Con
     assert [line["true_eyes_m"] is None for line in kept.lines] == [True, False, True]
 
 
-def test_lines_that_wait_are_bounded(content: ContentSource, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(refresh_lines, "WAITING_MAX", 16)
+def test_of_2048_lines_that_wait_the_oldest_is_written(content: ContentSource) -> None:
     observer, kept = looking(content)
     observer.sampled(sample(NS_PER_S))
-    for number in range(1, 101):
+    for number in range(1, 2048):
         observer.refreshed(refresh(number, None))
-    assert len(kept.lines) >= 100 - 16
-    assert {line["true_eyes_m"] for line in kept.lines} == {None}
+    assert kept.lines == []
+    observer.refreshed(refresh(2048, None))
+    assert [line["frame"] for line in kept.lines] == [1] and kept.lines[0]["true_eyes_m"] is None
 
 
 # --- sampled quality ---------------------------------------------------------------------------------------------
@@ -342,20 +342,6 @@ def test_in_real_time_one_measurement_runs_at_a_time_and_delays_nothing(
     assert observer.summary()["quality_frames"] == 1
 
 
-@pytest.mark.parametrize(("share", "begun"), [(1.0, True), (1e-9, False)])
-def test_measuring_takes_only_its_share_of_a_real_time_run(
-    share: float, begun: bool, content: ContentSource, solved: Solution, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sampling, "MEASURING_SHARE", share)
-    solver = Drawing(content, at_once=False)
-    observer, _ = looking(content, solver=solver, simulated=False, evaluate_every=1)
-    observer.refreshed(refresh(0, solved))
-    solver.draw()
-    assert wait_for_all(120.0) == 0
-    observer.refreshed(refresh(1, solved))
-    assert len(solver.orders) == begun
-
-
 def test_queued_layers_are_few_and_small(
     content: ContentSource, solved: Solution, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -364,20 +350,6 @@ def test_queued_layers_are_few_and_small(
     for number in range(20):
         observer.refreshed(refresh(number, solved))
     assert len(observer._sampler._waiting) == 2
-
-
-def test_a_few_samples_that_came_meanwhile_are_measured_at_the_end(content: ContentSource, solved: Solution) -> None:
-    solver = Drawing(content, at_once=False)
-    observer, _ = looking(content, solver=solver, simulated=False, evaluate_every=1)
-    for number in range(2 * sampling.HELD_MAX):
-        observer.sampled(sample(NS_PER_S + number * PERIOD_NS))
-        observer.refreshed(refresh(number, solved))
-    solver.draw()  # the first one's
-    solver.at_once = True
-    observer.finish()
-    last = 2 * sampling.HELD_MAX - 1
-    assert set(observer.live_errors) > {0, last} and len(observer.live_errors) == 1 + sampling.HELD_MAX
-    assert observer.moment is not None and observer.moment.lines[0].startswith(f"Refresh {last}:")
 
 
 def test_another_process_finds_the_same_figures_and_its_end_costs_one(content: ContentSource, solved: Solution) -> None:
@@ -577,17 +549,6 @@ def test_a_live_figure_has_an_age_and_follows_a_better_solution(live: Live, solv
     age_s = (later.account.frame - first) * PERIOD_NS / NS_PER_S
     assert live.observer.light(later)["light_age_s"] == pytest.approx(age_s, abs=0.06)
     assert eventually(lambda: live.light(replace(solved, number=2))["measured_frame"] != first)
-
-
-@pytest.mark.parametrize(("settled_s", "has_figure"), [(0.0, False), (600.0, True)])
-def test_a_refined_solution_that_stays_on_the_panels_has_no_old_figure(
-    live: Live, solved: Solution, monkeypatch: pytest.MonkeyPatch, settled_s: float, has_figure: bool
-) -> None:
-    monkeypatch.setattr(sampling, "SETTLED_S", settled_s)
-    live.measured(solved)
-    refined = replace(solved, number=2)
-    assert (live.db(refined) is not None) == has_figure
-    live.measured(refined)
 
 
 # --- kept light --------------------------------------------------------------------------------------------------

@@ -61,12 +61,39 @@ def test_a_solution_is_handed_over_exactly_when_its_cost_has_passed(
     assert made.stage_ms == {"render": 8.0, "prepare": 4.0, "inference": 3.0, "finish": 8.0, "step": 0.0}
 
 
+@pytest.mark.parametrize(
+    ("effort", "people", "stage_ms", "cost_ms"),
+    [
+        (Effort(1, 3), (1,), [8, 4, 3, 8, 30], 53),
+        (Effort(1, 3), (1, 2), [16, 8, 6, 8, 60], 98),
+        (Effort(1, 5, continued_from=3), (1,), [0, 0, 0, 8, 20], 28),
+    ],
+)
+def test_a_solution_s_stages_take_as_long_as_configured(
+    host: SimulatedSolver, parts: FakeParts, clock: SimulatedClock,
+    effort: Effort, people: tuple[int, ...], stage_ms: list[float], cost_ms: int,
+) -> None:  # fmt: skip
+    parts.stage_ms = {**COST_MS, "step": 10.0}
+    parts.behave = lambda request: SolverUpdate(solution=solution(3, effort=effort, people=people))
+    host.post(wish(5))
+    clock.advance_ns(cost_ms * NS_PER_MS - 1)
+    assert host.news().solution is None
+    clock.advance_ns(1)
+    assert [*host.news().solution.stage_ms.values()] == stage_ms
+
+
+def test_a_host_is_closed_once(host: SimulatedSolver, parts: FakeParts) -> None:
+    host.close()
+    host.close()
+    assert parts.closed == 1
+
+
 def test_a_busy_solver_says_when_it_will_begin_another_request(host: SimulatedSolver, clock: SimulatedClock) -> None:
     now_ns = clock.now_ns()
     assert host.free_ns(now_ns) == now_ns
     host.post(wish(1))
     assert host.free_ns(now_ns) == now_ns + SUM_NS
-    clock.advance_ns(SUM_NS)
+    clock.advance_ns(SUM_NS + 1)
     assert host.free_ns(clock.now_ns()) == clock.now_ns()
 
 
@@ -84,6 +111,11 @@ def test_a_busy_solver_takes_the_newest_request_next(
     assert host.news().solution.solved_for_ns == 4
     clock.advance_ns(10 * SUM_NS)
     assert [request.time_ns for request in parts.asked] == [begun_ns, 1, 4]  # skipped requests are never solved
+    host.post(wish(5))
+    host.post(wish(6))
+    clock.advance_ns(SUM_NS)
+    host.post(wish(7))  # the solver has begun the one before, although nobody has looked
+    assert [request.time_ns for request in parts.asked][3:] == [5, 6]
 
 
 def test_nothing_depends_on_when_it_is_looked_at(clock: SimulatedClock) -> None:

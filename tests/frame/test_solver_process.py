@@ -28,6 +28,7 @@ from runtime.frame.messages import (
     SolverUpdate,
     Stepped,
 )
+from runtime.frame.solver_host import first_request
 from runtime.frame.solver_process import REPLACED, Known, SolverProcess
 from runtime.model.buffers import LayerSlots
 from runtime.records import Effort
@@ -61,6 +62,9 @@ class FakeWorker:
 
     def restart(self, reason: str) -> None:
         self.ended.append(reason)
+
+    def status(self) -> dict[str, Any]:
+        return {"role": "solver"}
 
     def close(self) -> None:
         self.closed += 1
@@ -200,19 +204,23 @@ def test_a_solver_that_ended_is_named_with_the_time_it_is_gone(hosting: Hosting)
 
 def test_orders_wait_in_line_and_those_under_way_end_with_their_solver(hosting: Hosting) -> None:
     answers: list[Answer] = []
+    hosting.host.post(first_request(5))
     skip, draw = (hosting.host.send(order, answers.append) for order in (Skip(1), Draw({}, None, 40.0)))
     hosting.worker.takes = False
     waiting = hosting.host.send(Skip(2), answers.append)
     hosting.worker.takes = True
     last = hosting.host.send(Skip(3), answers.append)
-    assert [order.number for order in hosting.worker.sent] == [skip, draw], "in order, after the one that waits"
+    request, *orders = hosting.worker.sent
+    assert request == first_request(5) and [order.number for order in orders] == [skip, draw], (
+        "in order, after the one that waits"
+    )
     hosting.worker.messages = [Progress(skip, "loading"), Ended("it crashed")]
     hosting.worker.takes = False
     hosting.host.news()
     assert answers == [Progress(skip, "loading"), Done(skip, REPLACED), Drawn(draw, None)]
     hosting.worker.takes = True
     hosting.host.news()
-    assert [order.number for order in hosting.worker.sent] == [skip, draw, waiting, last]
+    assert [order.number for order in hosting.worker.sent[1:]] == [skip, draw, waiting, last]
     hosting.worker.messages = [Done(waiting), Done(last)]
     hosting.host.news()
     assert answers[3:] == [Done(waiting), Done(last)]
@@ -225,6 +233,7 @@ def test_a_lost_context_of_the_panels_replaces_the_solver_once(hosting: Hosting)
     for _ in range(2):
         hosting.host.news()
     hosting.host.restart("was ended because it took too long")
+    assert hosting.host.status() == [{"role": "solver"}]
     assert hosting.worker.ended == [
         "was ended because the panels have lost their OpenGL context", "was ended because it took too long",
     ]  # fmt: skip

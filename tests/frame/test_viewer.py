@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -79,15 +80,54 @@ def test_eyes_lost_at_rest_are_held_there_and_then_none() -> None:
     assert told[-1].eyes_m is None
 
 
-@pytest.mark.parametrize("x_m", [0.065, 0.0, -0.5])
-def test_eyes_behind_or_in_the_panels_are_none_counted_by_reason(x_m: float) -> None:
+@pytest.mark.parametrize(("x_m", "is_seen"), [(0.0701, True), (0.0699, False), (0.0, False), (-0.5, False)])
+def test_eyes_behind_or_in_the_panels_are_none_counted_by_reason(x_m: float, is_seen: bool) -> None:
+    """Or a centimetre in front of them."""
     seen = viewer()
     for number in range(5):
         place = aside(x_m=x_m - EYES[0, 0])
         seen.take(SensorFrame(number, NS_PER_S + number * NS_PER_S // 30, EyePoints(place, np.ones(2))), serial="")
         told = seen.at(NS_PER_S + number * NS_PER_S // 30 + NS_PER_MS)
-        assert (told.label, told.eyes_m) == ("none", None)
-    assert seen.refused == {"not in front of the panels": 5}
+        assert (told.eyes_m is not None, told.people, seen.in_view) == ((True, (1,), 1) if is_seen else (False, (), 0))
+    assert seen.refused == ({} if is_seen else {"not in front of the panels": 5})
+
+
+def test_eyes_that_are_expected_within_the_panels_are_none() -> None:
+    """A head comes nearer at a metre per second, 3 cm before the panels."""
+    seen = viewer(plan={"enabled": False})
+    for number in range(10):
+        eyes = EyePoints(aside(x_m=0.09 + 0.03 * (9 - number) - EYES[0, 0]), np.ones(2))
+        seen.take(SensorFrame(number, NS_PER_S + number * 30 * NS_PER_MS, eyes), serial="")
+    newest_ns = NS_PER_S + 9 * 30 * NS_PER_MS
+    near, nearer = (seen.ahead(newest_ns + ahead_ms * NS_PER_MS) for ahead_ms in (10, 35))
+    assert near.eyes_m is not None and (nearer.eyes_m, nearer.label) == (None, "none")
+
+
+@pytest.mark.parametrize(
+    ("captures_ms", "rate_hz"),
+    [
+        ([], None),
+        ([100], None),
+        ([100, 100], None),
+        ([100, 90], None),
+        ([0, 100, 150], 13.33),
+        ([0, *range(1000, 1640, 10)], 100.0),
+    ],
+)
+def test_the_rate_is_that_of_the_latest_64_samples(captures_ms: list[int], rate_hz: float | None) -> None:
+    seen = viewer()
+    for number, capture_ms in enumerate(captures_ms):
+        seen.take(SensorFrame(number, capture_ms * NS_PER_MS, None), serial="")
+    assert seen.rate_hz == rate_hz
+
+
+def test_a_calibration_of_another_sensor_is_warned_of_once(caplog: pytest.LogCaptureFixture) -> None:
+    calibration = load_calibration(None)
+    calibration = replace(calibration, file=calibration.file.model_copy(update={"sensor_serial": "A-1"}))
+    seen = Viewer(Settings(), calibration, front_m=FRONT_M, in_stack_frame=True)
+    for number, serial in enumerate(("", "F-1", "F-1")):
+        seen.take(SensorFrame(number, number, None), serial=serial)
+        assert caplog.text.count("A-1") == (serial != "")
 
 
 def test_looking_ahead_for_the_solver_changes_nothing_of_what_is_shown() -> None:
