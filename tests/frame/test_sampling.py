@@ -108,7 +108,7 @@ def test_a_tenth_of_a_run_at_most_is_spent_on_measuring(of: Callable[..., Sample
     assert sampled.shows(3, at_s=20.01) == 1
 
 
-def test_three_tenths_at_most_of_a_live_page_s_run_are_spent_on_measuring(of: Callable[..., Sampled]) -> None:
+def test_three_tenths_of_a_live_run_are_spent_on_measuring(of: Callable[..., Sampled]) -> None:
     """Each refresh shows another solution."""
     sampled = of(newest=True)
     assert [sampled.shows(n, at_s=n / 10, of=n) for n in range(4)] == [0, 0, 0, 1]
@@ -117,7 +117,7 @@ def test_three_tenths_at_most_of_a_live_page_s_run_are_spent_on_measuring(of: Ca
     assert sampled.measured == [3] and sampled.shows(70, at_s=7.0, of=70) == 1
 
 
-def test_a_live_page_s_figure_is_measured_again_once_it_is_out_of_date(of: Callable[..., Sampled]) -> None:
+def test_a_live_figure_is_measured_again_once_out_of_date(of: Callable[..., Sampled]) -> None:
     sampled = of(newest=True)
 
     def ordered(at_s: float, *, solution: int = 1, **changes: Any) -> int:
