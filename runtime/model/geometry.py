@@ -76,8 +76,8 @@ class Geometry:
     kept: PixelRect  # part of the middle panel's box that rays pass through
     rays: PixelRect  # picture pixels whose rays pass through `kept`
     middle_from_rays: F64  # (V, 3, 3) for each eye, from pixels in `rays` to pixels in the middle panel's box
-    taper_px: tuple[float, float] = (0.0, 0.0)  # width of a window's taper, right and down, in middle-panel pixels
-    points: int = 1  # points of each pupil that have separate views; the views of each point in turn
+    taper_px: tuple[float, float]  # width of a window's taper, right and down, in middle-panel pixels
+    points: int  # points of each pupil that have separate views; the views of each point in turn
 
     @property
     def middle(self) -> int:
@@ -237,8 +237,8 @@ def panel_from_middle(stack: PanelStack, rasters: Sequence[PlaneRaster], eye_m: 
 
 
 def visible_boxes(eyes_m: Eyes, stack: PanelStack) -> tuple[PixelRect, ...]:
-    """Return, for each panel, the padded box of pixels that an eye sees through all the other panels. If
-    the eyes see nothing through all panels, the boxes have the minimum size.
+    """Return, for each panel, the padded box of pixels that an eye sees through all the other panels. Boxes
+    are never empty, even if the eyes see nothing through all panels.
     """
     planes, half = [Plane(x_m) for x_m in stack.x_m], np.array([stack.width_m, stack.height_m]) / 2
     middle = planes[stack.count // 2]

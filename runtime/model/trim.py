@@ -209,8 +209,8 @@ def whole_rays(box: PixelRect, eyes_m: Eyes, stack: PanelStack) -> PixelRect:
     for axis, (start, end, whole) in enumerate(((box.u0, box.u1, stack.width_px), (box.v0, box.v1, stack.height_px))):
         low = ((start - whole / 2 - shift_px[..., axis]) / scale).max() + whole / 2 + EDGE_PX
         high = ((end - whole / 2 - shift_px[..., axis]) / scale).min() + whole / 2 - EDGE_PX
-        first = max(int(np.ceil(low)), start) if start > 0 else 0
-        last = min(int(np.floor(high)), end) if end < whole else whole
+        first = int(np.ceil(low)) if start > 0 else 0
+        last = int(np.floor(high)) if end < whole else whole
         limits.append((first, max(first, last)))
     (u0, u1), (v0, v1) = limits
     return PixelRect(u0, v0, u1, v1)
@@ -234,10 +234,11 @@ def window_around(box: PixelRect, eyes_m: Eyes, stack: PanelStack, *, parallaxes
     spans: list[tuple[int, int]] = []
     for axis, (start, end, whole) in enumerate(((box.u0, box.u1, stack.width_px), (box.v0, box.v1, stack.height_px))):
         shift, ends = shift_px[..., axis], (start - whole / 2, end - whole / 2)  # relative to the panel's centre
+        # At least 0, on the centre panel.
         before, after = (ends[0] - (ends[0] * scale + shift)).max(), (ends[1] * scale + shift - ends[1]).max()
         room = parallaxes * float(np.ptp(shift, axis=0).max()) + MARGIN_PX
-        low = max(start - (PANEL_CROSSINGS * max(float(before), 0.0) + room), 0.0)
-        high = min(end + (PANEL_CROSSINGS * max(float(after), 0.0) + room), float(whole))
+        low = max(start - (PANEL_CROSSINGS * float(before) + room), 0.0)
+        high = min(end + (PANEL_CROSSINGS * float(after) + room), float(whole))
         step = whole / WINDOW_SHARES
         size = min(int(np.ceil(np.ceil((high - low) / step) * step / 8) * 8), whole)
         first = int(np.clip(np.floor((low + high - size) / 2), 0, whole - size))

@@ -10,21 +10,25 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from runtime.model.geometry import TargetView
-from runtime.model.job import Job, Targets
+from runtime.model.job import Job, Savings, SolveWindow, Targets, drawn_job, drawn_views
 from runtime.model.trim import (
     coarse_box,
     differing_box,
     differing_window,
+    extent_window,
     parallax_margin_px,
     steepness,
     steepness_beside,
     still_fits,
     taper_parallaxes,
+    taper_px,
+    trim,
     whole_rays,
     window_around,
 )
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
+from runtime.support.gl import DrawnPicture
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 960, 540)
 EYES = np.array([[0.6, -0.03, 0.05], [0.6, 0.03, 0.05]])
@@ -38,6 +42,8 @@ def test_the_box_is_exactly_where_they_differ(v: int, u: int, height: int, width
     right[v : v + height, u : u + width, 1] = (100 + step) % 256
     box = differing_box(left, right)
     assert box == PixelRect(u, v, min(u + width, 160), min(v + height, 100))
+    for first, last in ((box.u0, box.u0 + 1), (box.u1 - 1, box.u1)):
+        assert differing_box(left, right, known=PixelRect(first, box.v0, last, box.v1)) == box
 
 
 def test_a_picture_that_differs_everywhere_is_whole() -> None:
@@ -101,8 +107,13 @@ def test_a_phase_s_error_shows_most_before_mid_grey() -> None:
     assert steepness_beside(picture, box) == 0.0
     picture[70:, :80] = 127  # neither in other rows
     assert steepness_beside(picture, box) == 0.0
-    picture[20:60, :80, :3] = 127
-    assert steepness_beside(picture, box) > 0.9
+    for side in (slice(0, 80), slice(120, 200)):
+        grey = picture.copy()
+        grey[20:60, side, :3] = 127
+        assert steepness_beside(grey, box) > 0.9
+    assert steepness(np.array([0, 51], np.uint8)) == pytest.approx(0.32**0.5)  # 2·sqrt(0.2·0.8), and nothing
+    assert steepness(np.zeros((0, 3), np.uint8)) == 0.0
+    assert [taper_parallaxes(steep) for steep in (0.0, 0.5, 1.0)] == [6.0, 10.0, 14.0]
 
 
 def test_before_white_a_window_is_smaller_than_before_grey() -> None:
@@ -155,3 +166,128 @@ def test_a_window_of_over_six_tenths_of_the_panel_is_the_whole(share: float, who
     far = np.array([[1e6, -0.03, 0.0], [1e6, 0.03, 0.0]])  # without parallax, the window is the box and its margin
     found = window_around(box, far, replace(STACK, width_px=960), parallaxes=0.0)
     assert (found is None) == whole
+
+
+# Pixels of 1 mm and gaps of 10 mm: an eye's ray crosses the front panel at 0.98·u + shift, from the panel's centre, and
+# the rear one at 1.02·u - shift. The shifts are 1 pixel, left and right, and half a pixel up.
+THIN = PanelStack(0.8, 0.4, (-0.01, 0.0, 0.01), 800, 400)
+NEAR = np.array([[0.5, -0.05, 0.025], [0.5, 0.05, 0.025]])
+
+
+@pytest.mark.parametrize(
+    ("box", "held"),
+    [
+        ((300, 180, 340, 210), (243, 155, 395, 235)),
+        ((0, 0, 40, 30), (0, 0, 104, 80)),
+        ((760, 370, 800, 400), (696, 320, 800, 400)),
+        ((0, 180, 800, 210), (0, 155, 800, 235)),
+        ((300, 0, 340, 400), (243, 0, 395, 400)),
+    ],
+)
+def test_a_window_is_a_box_with_its_crossings_taper_and_margin(box: tuple[int, ...], held: tuple[int, ...]) -> None:
+    """First box: left 2 x 3 of crossings, 20 of tapers and 16 of margin, which makes sixteenths of the panel."""
+    found = window_around(PixelRect(*box), NEAR, THIN, parallaxes=10.0)
+    assert found is not None and found.corners == held
+
+
+@pytest.mark.parametrize(
+    ("box", "inner"),
+    [
+        ((200, 100, 400, 250), (207, 104, 396, 246)),
+        ((0, 100, 400, 400), (0, 104, 396, 400)),
+        ((400, 0, 800, 250), (404, 0, 800, 246)),
+        ((200, 100, 208, 107), (207, 104, 207, 104)),  # none
+    ],
+)
+def test_whole_rays_stay_two_pixels_inside_a_window_on_every_panel(
+    box: tuple[int, ...], inner: tuple[int, ...]
+) -> None:
+    assert whole_rays(PixelRect(*box), NEAR, THIN).corners == inner
+
+
+def test_tapers_are_as_wide_as_the_eyes_parallaxes() -> None:
+    rolled = NEAR + np.array([[0.0, 0.0, -0.01], [0.0, 0.0, 0.01]])
+    assert taper_px(NEAR, THIN, parallaxes=10.0) == pytest.approx((20.0, 0.0))
+    assert taper_px(rolled, THIN, parallaxes=10.0) == pytest.approx((20.0, 4.0))
+    assert parallax_margin_px(rolled, THIN)[1, 2] == pytest.approx([1.0, -0.7])
+
+
+@pytest.mark.parametrize(
+    ("held", "fits"),
+    [
+        ((100, 100, 230, 200), True),
+        ((100, 100, 231, 200), False),
+        ((101, 100, 210, 200), False),
+        ((100, 101, 200, 210), False),
+        ((90, 100, 199, 200), False),
+        ((100, 90, 200, 199), False),
+    ],
+)
+def test_a_window_is_kept_if_it_holds_the_new_one_tightly(held: tuple[int, ...], fits: bool) -> None:
+    assert still_fits(PixelRect(*held), PixelRect(100, 100, 200, 200)) == fits
+
+
+def test_a_quick_comparison_sees_every_sixteenth_pixel() -> None:
+    left = np.full((100, 160, 4), 100, np.uint8)
+    right = left.copy()
+    right[17:48, 33:64] = 50  # samples at row 32 and column 48
+    assert coarse_box(left, right) == PixelRect(48, 32, 49, 33)
+    right[16, 80] = 50
+    assert coarse_box(left, right) == PixelRect(48, 16, 81, 33)
+
+
+def test_the_window_of_known_content_depends_on_its_background() -> None:
+    extent = PixelRect(300, 180, 380, 210)
+    black, mixed = (extent_window(extent, colour, NEAR, THIN) for colour in ((0, 0, 0), (0, 51, 255)))
+    assert black is not None and mixed is not None
+    assert black.taper_px == pytest.approx((12.0, 0.0)) and mixed.taper_px == pytest.approx((24.8, 0.0))
+    assert (black.colour, mixed.colour) == ((0, 0, 0), (0, 51, 255))
+    assert black.box.corners == (262, 155, 414, 235) and black.kept.corners == (268, 158, 410, 231)
+    assert mixed.box.corners == (238, 155, 438, 235)
+    assert extent_window(extent, (0, 0, 0), NEAR, THIN, mixed) == black  # the old one is too large
+    slightly = replace(black, box=PixelRect(260, 155, 416, 240))
+    kept = extent_window(extent, (0, 0, 0), NEAR, THIN, slightly)
+    assert kept is not None and kept.box == slightly.box and kept.kept.corners == (266, 158, 412, 236)
+    assert extent_window(PixelRect(300, 180, 300, 210), (0,), NEAR, THIN) is None
+    assert extent_window(PixelRect(0, 0, 800, 400), (0,), NEAR, THIN, black) is None
+
+
+def pair(right_codes: int = 100) -> list[np.ndarray]:
+    """Pictures for the panels: grey, but for coloured columns on the left; they differ in the middle."""
+    left = np.full((400, 800, 4), 100, np.uint8)
+    left[:, :8, 0] = 200
+    right = left.copy()
+    right[180:210, 300:340, :3] = right_codes
+    return [left, right]
+
+
+def test_a_job_is_trimmed_to_where_its_pictures_differ() -> None:
+    whole = drawn_job(pair(120), NEAR, THIN)
+    job = trim(whole)
+    assert job.window is not None and job.window.colour is None
+    assert job.window.box.corners == (243, 155, 395, 235)
+    assert job.channels == 1  # the colour is outside the window
+    assert job.savings == Savings(152 * 80 / 320_000, 1) and whole.savings == Savings(1.0, 3)
+    assert trim(replace(whole, window=job.window)).window is job.window
+    wide = SolveWindow(PixelRect(0, 155, 800, 235), PixelRect(0, 155, 800, 235), (1.0, 1.0))
+    assert trim(replace(whole, window=wide)).channels == 3
+    assert trim(whole, wide) == job
+
+
+def test_equal_pictures_need_no_steps_and_textures_are_not_compared() -> None:
+    job = trim(drawn_job(pair(), NEAR, THIN))
+    assert job.window == SolveWindow(PixelRect(0, 0, 0, 0), PixelRect(0, 0, 0, 0), (0.0, 0.0))
+    assert (job.channels, job.savings.solved_share) == (3, 0.0)
+    for flags, channels in (((True, True), 1), ((True, False), 3)):
+        textures = [DrawnPicture(None, None, pair()[0], grey) for grey in flags]  # type: ignore[arg-type]
+        drawn = trim(drawn_job(textures, NEAR, THIN))
+        assert (drawn.window, drawn.channels) == (None, channels)
+
+
+def test_a_third_view_widens_the_window() -> None:
+    left, right = pair(120)
+    third = left.copy()
+    third[180:210, 440:480, :3] = 120
+    eyes_m = np.concatenate([NEAR, NEAR[:1]])
+    window = differing_window(Job(Targets(THIN, eyes_m, drawn_views([left, right, third], THIN))))
+    assert window is not None and window.box.u0 < 260 and window.box.u1 > 520

@@ -6,7 +6,17 @@ import numpy as np
 import pytest
 
 from runtime.kernels import FULL, SUBCODE
-from runtime.model.targets import flat_layers, phase_codes
+from runtime.model.targets import (
+    flat_layers,
+    is_grey,
+    middle_codes,
+    outside_codes,
+    phase_codes,
+    rest_of,
+    slope_of,
+    target_table,
+    without_alpha,
+)
 from runtime.optics.malus import intensity_from_phase, rest_value
 from runtime.optics.stack import PanelStack
 
@@ -48,3 +58,38 @@ def test_phase_codes_are_phases_in_sixteenths_of_a_code(branch: int) -> None:
     assert np.abs(intensity_from_phase(table / FULL) * 255 - np.arange(256)).max() < 0.8 / SUBCODE
     low, high = (0, FULL) if branch == 1 else (FULL, 2 * FULL)
     assert table.min() == low and table.max() == high
+
+
+@pytest.mark.parametrize(
+    ("panels", "rest", "slope", "middle"),
+    [
+        (2, 3060, 1, [255, 243, 191, 142, 64]),
+        (3, 2040, 1, [255, 180, 127, 78, 0]),
+        (4, 1530, 1, [223, 148, 95, 47, 0]),
+        (5, 2040, 2, [0, 75, 128, 177, 255]),
+        (6, 1020, 1, [191, 116, 63, 15, 0]),
+    ],
+)
+def test_targets_show_their_codes_on_the_slope_nearest_to_rest(
+    panels: int, rest: int, slope: int, middle: list[int]
+) -> None:
+    assert (rest_of(panels), slope_of(panels)) == (rest, slope)
+    sums, weights = target_table(panels).T
+    assert np.abs(intensity_from_phase(sums.astype(np.float64) / FULL) * 255 - np.arange(256)).max() < 1e-3
+    assert sums[0] == 2 * FULL and sums[255] == (FULL if slope == 1 else 3 * FULL)
+    assert weights[[0, 51, 128, 204, 255]] == pytest.approx([0.25, 0.87413, 1.0, 0.87413, 0.25], abs=1e-4)
+    assert middle_codes(panels)[[0, 51, 128, 200, 255]].tolist() == middle
+
+
+def test_panels_outside_a_window_rest_beside_the_middle_one() -> None:
+    assert [outside_codes(3, n, 90) for n in range(3)] == [[128] * 3, [90] * 3, [128] * 3]
+    assert [outside_codes(2, n, (0, 51, 255)) for n in range(2)] == [[191] * 3, [255, 243, 64]]
+
+
+def test_alpha_is_no_colour() -> None:
+    picture = np.full((40, 40, 4), (7, 7, 7, 255), np.uint8)
+    assert is_grey(picture) and is_grey(picture[..., :3])
+    picture[3, 5, 1:3] = 8
+    assert not is_grey(picture) and is_grey(picture[4:])
+    assert without_alpha(picture, 3)[3, 5].tolist() == [7, 8, 8] and without_alpha(picture, 3).shape == (40, 40, 3)
+    assert (without_alpha(picture, 1) == np.full((40, 40), 7)).all()
