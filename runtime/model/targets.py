@@ -55,7 +55,7 @@ def outside_codes(panels: int, n: int, outside: int | tuple[int, ...]) -> list[i
 
 
 @lru_cache(maxsize=4)
-def phase_codes(branch: Branch = 2) -> I16:
+def phase_codes(branch: Branch) -> I16:
     """Return the (256,) sums of panel values, in sixteenths of a code, for each code to be seen."""
     codes = np.arange(256) / 255.0
     return np.rint(phase_from_intensity(codes, branch) * FULL).astype(np.int16)

@@ -90,6 +90,7 @@ def test_alpha_is_no_colour() -> None:
     picture = np.full((40, 40, 4), (7, 7, 7, 255), np.uint8)
     assert is_grey(picture) and is_grey(picture[..., :3])
     picture[3, 5, 1:3] = 8
-    assert not is_grey(picture) and is_grey(picture[4:])
-    assert without_alpha(picture, 3)[3, 5].tolist() == [7, 8, 8] and without_alpha(picture, 3).shape == (40, 40, 3)
+    assert not is_grey(picture) and is_grey(picture[4:]) and not is_grey(picture[3:, 5:])
+    for given in (picture, picture[..., :3]):
+        assert without_alpha(given, 3)[3, 5].tolist() == [7, 8, 8] and without_alpha(given, 3).shape == (40, 40, 3)
     assert (without_alpha(picture, 1) == np.full((40, 40), 7)).all()
