@@ -75,7 +75,7 @@ def differing_window(job: Job, before: SolveWindow | None = None) -> SolveWindow
     first, *others = pictures
 
     def window_of(box: PixelRect) -> SolveWindow | None:
-        grown = PixelRect(*(begin + scale * at for begin, at in zip(origin * 2, box.corners)))
+        grown = PixelRect(*(begin + scale * at for begin, at in zip((*origin, *origin), box.corners, strict=True)))
         return _window_around(grown, job.eyes_m, stack, before, steep=steepness_beside(first, box))
 
     # A quick comparison recognises windows that would be too large. An exact comparison is needed only for the others.

@@ -82,6 +82,8 @@ def test_rays_fade_over_a_sixth_of_the_window_s_taper() -> None:
     leaning = TargetView(PICTURE, STACK.panel(1).plane_from_raster() @ lean)
     found = geometry_of(STACK, EYES, [leaning] * 2, boxes=(box,) * 3, kept=kept, taper_px=(60.0, 24.0))
     assert found.rays.corners == (63, 0, 249, 133)
+    # At the middle of the rays, the weight is 1, for the range of the compiled loops' numbers.
+    assert found.closing_sets().panels_from_rays[..., 2, :] @ (93.0, 66.5, 1.0) == pytest.approx(np.ones((2, 3)))
     across, down = found.tapers()  # of the middle row and column of the rays
     assert across[4:8] == pytest.approx([0.0, 0.035242, 0.117958, 0.200528], abs=1e-6)
     assert down[115:119] == pytest.approx([1.0, 1.0, 0.933647, 0.75559], abs=1e-6)
@@ -97,8 +99,6 @@ def test_pixels_of_one_step_follow_their_eye_s_rays_through_every_panel() -> Non
         assert middle == pytest.approx([20.5, 10.5])
         assert rear == pytest.approx([-139.5 * 1.2 - 0.2 * eye_mm + 160, 70 - 59.5 * 1.2])
         assert front == pytest.approx([-139.5 * 0.8 + 0.2 * eye_mm + 160, 70 - 59.5 * 0.8])
-    # At the middle of the rays, the weight is 1, for the range of the compiled loops' numbers.
-    assert sets.panels_from_rays[..., 2, :] @ (70.0, 45.0, 1.0) == pytest.approx(np.ones((2, 3)))
 
 
 AHEAD, ASIDE = EYES, np.array([[0.4, 0.3, 0.0], [0.4, 0.3, 0.0]])  # "right" is +y, and (-0.6, 0.8, 0)
@@ -173,6 +173,7 @@ def view(scale: float = 1.0, first: tuple[float, float] = (0.0, 0.0), size: tupl
         ([view(), view(first=(10, -5))], (40, 30, 200, 130), (30, 30, 200, 135)),  # of both eyes
         ([view(first=(10, 20))] * 2, (0, 0, 200, 130), (0, 0, 190, 110)),
         ([view(first=(-300, -150))] * 2, (200, 100, 400, 200), (399, 199, 400, 200)),  # at least one ray
+        ([view(first=(300, 150))] * 2, (0, 0, 200, 100), (0, 0, 1, 1)),
         ([view(1 + 1e-9, (1e-8, 0))] * 2, (40, 30, 200, 130), (40, 30, 200, 130)),
     ],
 )
