@@ -21,7 +21,7 @@ from runtime.records import F64
 from tests.model.scenes import eyes
 
 STACK = PanelStack(0.48, 0.24, (-0.06, 0.0, 0.06), 480, 240)  # pixels of 1 mm
-WINDOW = SolveWindow(PixelRect(96, 80, 224, 160), PixelRect(112, 88, 208, 152), (24.0, 0.0))
+WINDOW = SolveWindow(PixelRect(96, 96, 224, 176), PixelRect(112, 104, 208, 168), (24.0, 0.0))
 EVEN = FULL // 2
 
 
@@ -60,7 +60,7 @@ Case = tuple[F64, Any, ChainFrame, Any]  # eyes, window, the raster, and the map
 def cases() -> dict[str, Case]:
     level, lying = eyes(0.6, 0.03, 0.02), np.array([[0.6, 0.0, 0.031], [0.6, 0.0, -0.031]])
     how: Any = {"most_cell_px": 4, "reduction": 2}
-    at_m = np.array([-0.08, 0.0])  # of the window's middle
+    at_m = np.array([-0.08, -0.016])  # of the window's middle
     own = PanelStack(0.128, 0.08, STACK.x_m, 128, 80)
     turned = np.stack([lying[:, 0], -lying[:, 2], -lying[:, 1]], axis=1)
     return {
@@ -124,19 +124,27 @@ def test_a_network_sees_half_the_difference_along_each_eye_s_rays(case: str) -> 
 
 
 def test_where_an_eye_has_no_picture_there_is_no_difference() -> None:
-    part = SolveWindow(PixelRect(100, 40, 380, 200), PixelRect(100, 40, 380, 200), (0.0, 0.0))
-    pictures = [np.full((160, 280, 4), code, np.uint8) for code in (90, 160)]
+    """Its edge goes on for a fortieth of its smaller side, and what is sharpened spreads by another column."""
+    part = SolveWindow(PixelRect(100, 80, 380, 160), PixelRect(100, 80, 380, 160), (0.0, 0.0))
+    pictures = [np.full((80, 280, 4), code, np.uint8) for code in (90, 160)]
     job = Job(Targets(STACK, eyes(0.6), drawn_views(pictures, STACK, part)), channels=1)
     _, _, session = asked(job)
     frame = chain_frame(job.eyes_m, STACK, most_cell_px=4, reduction=2)
     v, u = np.mgrid[: frame.rows, : frame.width_px] + 0.5
     at = np.stack([u, v, np.ones_like(u)], axis=-1) @ frame.plane_from_raster.T
     point = crossing(at[..., :2], job.eyes_m[0], x_m=frame.x_m, to_x_m=0.0)
-    past_px = np.maximum(abs(point[..., 0]) - 0.14, abs(point[..., 1]) - 0.08) * 1000
+    past_px = np.maximum(abs(point[..., 0]) - 0.14, abs(point[..., 1]) - 0.04) * 1000
     given = session.feeds["left"].reshape(past_px.shape)
     first, second = phase_from_intensity(np.array([90, 160]) / 255, 2) * FULL / 2
     assert np.abs(given[past_px < -2] - (first - second)).max() <= 1
-    assert (past_px > 6).sum() > 1000 and (given[past_px > 6] == 0).all()
+    assert (past_px > 4.5).sum() > 1000 and (given[past_px > 4.5] == 0).all()
+    assert (np.abs(given[(past_px > 0) & (past_px < 1.5)]) > 50).all()
+
+
+def test_one_eye_for_both_is_solved_on_a_level_raster() -> None:
+    found, _, session = asked(brighter(eyes(0.6)[[0, 0]]))
+    rows, cells, size = session.feeds["left"].shape
+    assert (rows, size) == (120, 12) and 24 <= cells <= 64 and sorted(found) == [0, 2]
 
 
 def test_panels_fade_to_rest_at_a_window_s_edges() -> None:

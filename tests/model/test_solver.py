@@ -105,12 +105,12 @@ REFINED = [(0.8, "falling"), (0.8, "rising")]
 
 
 @pytest.mark.parametrize(
-    ("steps", "told"),
-    [(None, OWN), (0, []), (1, OWN[:1]), (2, OWN), (5, OWN + REFINED + REFINED[:1])],
+    ("own", "steps", "told"),
+    [(2, None, OWN), (2, 0, []), (2, 1, OWN[:1]), (2, 5, OWN + REFINED + REFINED[:1]), (1, 3, OWN[:1] + REFINED)],
 )
-def test_a_model_s_steps_follow_its_proposal_then_refining_ones(steps: int | None, told: list[Any]) -> None:
+def test_a_model_s_steps_follow_its_proposal_then_refining_ones(own: int, steps: int | None, told: list[Any]) -> None:
     device = Device()
-    found = model(Network(), device).solve(job(steps=steps))
+    found = model(Network(), device, STEPS[:own]).solve(job(steps=steps))
     assert device.told == [*PROPOSED, *told, "write 128"]
     assert (found.steps, found.continued_from, found.floats) == (len(told), None, None)
     assert set(found.stage_ms) == {"prepare", "inference", "finish", "step"}
