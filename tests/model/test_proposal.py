@@ -144,7 +144,7 @@ def test_where_an_eye_has_no_picture_there_is_no_difference() -> None:
 def test_one_eye_for_both_is_solved_on_a_level_raster() -> None:
     found, _, session = asked(brighter(eyes(0.6)[[0, 0]]))
     rows, cells, size = session.feeds["left"].shape
-    assert (rows, size) == (120, 12) and 24 <= cells <= 64 and sorted(found) == [0, 2]
+    assert (rows, size) == (120, 12) and 48 <= cells <= 96 and sorted(found) == [0, 2]
 
 
 def test_panels_fade_to_rest_at_a_window_s_edges() -> None:
