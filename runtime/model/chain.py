@@ -105,8 +105,8 @@ class ChainFrame:
         moved_m = eye_sigma_m * reach
         # Metres to the right and up per column, and metres up per row, at the raster's middle.
         raster = self.plane_from_raster
-        at = raster @ (self.columns.middle, self.rows / 2, 1.0)
-        (across_m, along_m), (_, down_m) = ((raster[:2, k] - at[:2] / at[2] * raster[2, k]) / at[2] for k in (0, 1))
+        at = raster @ (self.columns.middle, self.rows / 2, 1.0)  # whose weight is 1
+        (across_m, along_m), (_, down_m) = (raster[:2, k] - at[:2] * raster[2, k] for k in (0, 1))
         columns = moved_m / abs(across_m) * cell_px / self.cell_px
         rows = moved_m * np.hypot(1.0, along_m / across_m) / abs(down_m)
         return np.array([columns, rows, cell_px * centre / reach], np.float32)

@@ -246,3 +246,23 @@ def test_eyes_whose_raster_would_be_far_higher_than_the_panels_are_refused() -> 
     pair = np.array([[50.0, 50.0, 50.0], [0.07, -50.0, -50.0]])
     with pytest.raises(ValueError, match="times as high"):
         chain_frame(pair, STACK, most_cell_px=4, reduction=2)
+
+
+def test_a_raster_is_at_least_a_tenth_as_wide_as_the_panels() -> None:
+    """These eyes see nothing through all three panels, which are wide, so that columns are fine."""
+    wide = PanelStack(5.184, 2.916, (-0.06, 0.0, 0.06), 3840, 2160)
+    frame = chain_frame(eyes(0.3, 14.0), wide, most_cell_px=4, reduction=1)
+    assert 0.1 <= abs(frame.plane_from_raster[0, 0]) * frame.width_px / wide.width_m < 0.13
+
+
+@pytest.mark.parametrize(
+    ("nearer_m", "bent"), [(0.0005, False), (0.03, True), (0.06, True), (0.07, False), (-0.1, False)]
+)
+def test_columns_are_even_if_the_eyes_line_meets_the_raster_or_hardly_its_plane(nearer_m: float, bent: bool) -> None:
+    pair = np.array([[0.6 + nearer_m, -0.03, 0.0], [0.6 - nearer_m, 0.03, 0.0]])
+    frame = chain_frame(pair, STACK, most_cell_px=4, reduction=2)
+    assert bool(frame.columns.bend) == bent == (frame.rows != 136)
+    at = np.array([frame.width_px / 2, frame.rows / 2, 1.0])
+    for x_m, sign in ((STACK.x_m[0], 1), (STACK.x_m[2], -1)):
+        there = [frame.frame_from_plane(x_m=x_m) @ frame.plane_from_frame(eye, x_m=x_m) @ at for eye in pair]
+        assert [t[0] / t[2] - at[0] for t in there] == pytest.approx([sign * 2.0, -sign * 2.0], rel=0.02)

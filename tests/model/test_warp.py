@@ -10,7 +10,9 @@ import pytest
 from numpy.typing import NDArray
 
 from runtime.model.chain import ColumnLaw
-from runtime.model.warp import warp
+from runtime.model.geometry import TargetView
+from runtime.model.warp import picture_on, reduced_view, resized_px, source_px, warp
+from runtime.optics.stack import PlaneRaster
 from runtime.records import F64, I16
 
 OUTSIDE = -1
@@ -98,3 +100,53 @@ def test_mirrored_columns_are_sampled_in_the_same_time(bent: str) -> None:
     found, mirrored_s = warped(backwards, np.ascontiguousarray(image[:, ::-1]), **mirrored_laws)
     assert np.abs(found - expected).max() <= 1
     assert mirrored_s < 3 * seconds
+
+
+def test_a_pixel_spans_as_many_source_pixels_as_at_the_middle() -> None:
+    assert source_px(np.diag([2.0, 3.0, 1.0]), (200, 100)) == (2.0, 3.0)
+    leaning = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1e-3, 0.0, 1.0]])  # at u = 100, the weight is 1.1
+    assert source_px(leaning, (200, 100)) == pytest.approx((np.hypot(1 / 1.21, 0.05 / 1.21), 1 / 1.1))
+
+
+@pytest.mark.parametrize(
+    ("pixels", "scale", "resized"),
+    [(100, 2.0, 50), (100, 0.5, 200), (100, 0.25, 400), (100, 0.1, 400), (100, 50.0, 16), (10, 50.0, 10)],
+)
+def test_pictures_are_resized_within_limits(pixels: int, scale: float, resized: int) -> None:
+    assert resized_px(pixels, scale) == resized
+
+
+RASTER = PlaneRaster(0.0, -0.032, 0.024, 1e-3, 1e-3, 64, 48)
+
+
+@pytest.mark.parametrize(
+    ("reduction", "times", "size", "shrunk"),
+    [
+        (1, 1, (49, 66), (1, 1)),
+        (2, 1, (49, 66), (2, 2)),
+        (2, 2, (98, 132), (4, 4)),
+        (4, 1, (49, 66), (3, 4)),  # each side keeps 16 pixels
+        (9, 1, (20, 200), (1, 9)),
+    ],
+)
+def test_pictures_are_averaged_to_pixels_of_the_reduced_panel(
+    reduction: int, times: int, size: tuple[int, int], shrunk: tuple[int, int]
+) -> None:
+    picture = np.random.default_rng(3).integers(0, 256, (*size, 3)).astype(np.uint8)
+    view = TargetView(picture, RASTER.plane_from_raster() @ np.diag([1 / times, 1 / times, 1.0]))
+    found, (by_v, by_u) = reduced_view(view, RASTER, reduction), shrunk
+    assert found.pixels.shape == (size[0] // by_v, size[1] // by_u, 3)
+    assert np.abs(found.pixels[1, 2] - picture[by_v : 2 * by_v, 2 * by_u : 3 * by_u].mean(axis=(0, 1))).max() <= 0.5
+    assert found.plane_from_picture @ (2, 1, 1) == pytest.approx(view.plane_from_picture @ (2 * by_u, by_v, 1))
+
+
+def test_a_picture_on_the_raster_is_not_resampled() -> None:
+    picture = np.random.default_rng(3).integers(0, 256, (48, 64, 3)).astype(np.uint8)
+    how: Any = {"edge": 1, "size": (48, 64)}
+    for shift_px, same in ((1e-7, True), (1e-5, False), (1.0, False)):
+        moved = np.array([[1.0, 0.0, shift_px], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+        view = TargetView(picture, 5 * RASTER.plane_from_raster())
+        found = picture_on(view, RASTER, middle_from_result=moved, **how)
+        assert (found is picture) == same and (found[:, 3] == picture[:, 3 + round(shift_px)]).all()
+    coarse = picture_on(view, RASTER, middle_from_result=np.diag([2.0, 2.0, 1.0]), edge=1, size=(24, 32))
+    assert np.abs(coarse[5, 7] - picture[10:12, 14:16].mean(axis=(0, 1))).max() <= 1
