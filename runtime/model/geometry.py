@@ -237,8 +237,8 @@ def panel_from_middle(stack: PanelStack, rasters: Sequence[PlaneRaster], eye_m: 
 
 
 def visible_boxes(eyes_m: Eyes, stack: PanelStack) -> tuple[PixelRect, ...]:
-    """Return, for each panel, the padded box of pixels that an eye sees through all the other panels. They
-    are never empty, even if the eyes see nothing through all panels.
+    """Return each panel's padded box of pixels that an eye sees through all the other panels. No box is
+    empty, even if the eyes see nothing through all panels.
     """
     planes, half = [Plane(x_m) for x_m in stack.x_m], np.array([stack.width_m, stack.height_m]) / 2
     middle = planes[stack.count // 2]

@@ -49,6 +49,41 @@ def test_a_contract_that_does_not_fit_is_refused_by_field(change: dict[str, obje
         parse_contract({METADATA_KEY: json.dumps(contract_of("fast") | change)}, source="m.onnx")
 
 
+@pytest.mark.parametrize(
+    ("field", "good", "bad"),
+    [
+        ("panels", [2, 6], [1, 7]),
+        ("width_px", [0, 16384], [-1, 16385]),
+        ("height_px", [0, 16384], [-1, 16385]),
+        ("cell_px", [1, 64], [0, 65]),
+        ("picture_fov_deg", [0, 179.9], [-1, 180]),
+        ("parameters", [0], [-1]),
+        (
+            "inputs",
+            [[{"name": "x", "axes": ["a"] * 8}] * 32],
+            [[], [{"name": "x", "axes": []}] * 33, [{"name": "x", "axes": ["a"] * 9}]],
+        ),
+        ("outputs", [[{"name": "x", "axes": []}] * 32], [[{"name": "x", "axes": []}] * 33, [{"name": "", "axes": []}]]),
+        (
+            "steps",
+            [[], [{"size": 3}] * 64, [{"floor": 1}], [{"momentum": 0}]],
+            [[{}] * 65, [{"size": 3.1}], [{"size": 0}]],
+        ),
+        (
+            "steps",
+            [[{"momentum": 0.99, "floor": 0.01}]],
+            [[{"momentum": 1}], [{"momentum": -0.1}], [{"floor": 0}], [{"floor": 1.1}]],
+        ),
+    ],
+)
+def test_a_contract_s_limits_are_in_range(field: str, good: list[object], bad: list[object]) -> None:
+    for value in good:
+        parse_contract({METADATA_KEY: json.dumps(contract_of("fast") | {field: value})}, source="m.onnx")
+    for value in bad:
+        with pytest.raises(InputError, match=field):
+            parse_contract({METADATA_KEY: json.dumps(contract_of("fast") | {field: value})}, source="m.onnx")
+
+
 @pytest.mark.parametrize("text", [None, "{", "[1]", "[" * 100_000, '{"a":' * 100_000])
 def test_a_missing_or_malformed_contract_is_refused(text: str | None) -> None:
     with pytest.raises(InputError, match=METADATA_KEY):
