@@ -25,7 +25,6 @@ from runtime.records import F64
 ScaleRule = Literal["seed", "least-squares", "inverse"] | float
 EPSILON = float(np.finfo(np.float64).eps)
 ROTATION_BOUND_RAD = 1e-6  # rotation caused by rounding errors above which points are refused
-POLISH_ABOVE = 1e2  # ratio of the points' two largest extents above which the cross-covariance loses digits
 STARTS = 120  # number of random subsets to start from
 START_PAIRS = 4  # number of pairs in each subset
 STEPS = 4  # number of concentration steps from each subset
@@ -121,29 +120,28 @@ def fit(sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> Similarity:
     if not (np.isfinite(sensor_m).all() and np.isfinite(stack_m).all()):
         raise Degenerate("some coordinates are not finite")
     _refuse_degenerate("sensor", sensor_m)
-    first, second = _refuse_degenerate("stack", stack_m)
+    _refuse_degenerate("stack", stack_m)
     # Scale by powers of two, which is exact. Without scaling, the squares of 1e-200 m or 1e200 m would fall outside
     # float64's range.
     sensor_unit, stack_unit = (float(np.exp2(np.frexp(np.abs(p).max())[1])) for p in (sensor_m, stack_m))
     unit_rule = rule if isinstance(rule, str) else rule * sensor_unit / stack_unit
     unit_sensor, unit_stack = sensor_m / sensor_unit, stack_m / stack_unit
     unit = fit_batch(unit_sensor, unit_stack, rule=unit_rule)
-    if first > POLISH_ABOVE * second:
-        unit = _polished(unit, unit_sensor, unit_stack, rule=unit_rule)
     if not (np.isfinite(unit.scale) and unit.scale > 0):
         raise Degenerate(
             "the sensor points and the stack points are not correlated; check that the points of each pair belong "
             "together"
         )
+    unit = _turned_about_long_axis(unit, unit_sensor, unit_stack)
     return Similarity(unit.scale * (stack_unit / sensor_unit), unit.rotation, unit.translation_m * stack_unit)
 
 
-def _refuse_degenerate(name: str, points_m: F64) -> tuple[float, float]:
+def _refuse_degenerate(name: str, points_m: F64) -> None:
     first, second, _ = extents(points_m)
     magnitude = float(np.abs(points_m).max(initial=0.0))
     if first <= 4 * EPSILON * magnitude:
         raise Degenerate(f"the {name} points coincide; use viewpoints that are farther apart")
-    if second <= 4 * EPSILON * magnitude or second <= 1e-13 * first:
+    if second <= 4 * EPSILON * magnitude:
         raise Degenerate(f"the {name} points all lie on one line, so the rotation about that line is unknown")
     bound = 4 * EPSILON * magnitude / second  # verified with 50-digit arithmetic: `phasestack stability`
     if bound > ROTATION_BOUND_RAD:
@@ -151,45 +149,26 @@ def _refuse_degenerate(name: str, points_m: F64) -> tuple[float, float]:
             f"the {name} points are too close to one line or too far from the origin for double precision: "
             f"rounding alone rotates the result by up to {bound:.1g} rad"
         )
-    return float(first), float(second)
 
 
-def _polished(start: Similarity, sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> Similarity:
-    """Refine a fit for points that form a long, thin cloud.
+def _turned_about_long_axis(start: Similarity, sensor_m: F64, stack_m: F64) -> Similarity:
+    """Compute the rotation about the stack points' long axis again, from the coordinates across this axis alone.
 
-    Computing the cross-covariance squares the cloud's aspect ratio and loses digits. In the principal frame of the
-    stack's points, the rotation about the long axis has a closed form that involves only the small coordinates. The
-    other two rotations are refined by Gauss-Newton steps, solved with NumPy's `lstsq`. The error then grows with the
-    aspect ratio rather than with its square.
+    The cross-covariance squares the aspect ratio of a long, thin cloud, and so loses the digits of this rotation. Its
+    closed form in the points' principal frame has an error that grows with the aspect ratio rather than its square.
     """
     sensor, sensor_mean = _centred(sensor_m)
     stack, stack_mean = _centred(stack_m)
     _, _, axes = np.linalg.svd(stack, full_matrices=False)
     target = stack @ axes.T
     rotation = axes @ start.rotation  # from the sensor to the principal frame of the stack's points
-    norm = float(np.sqrt((stack**2).sum() / (sensor**2).sum()))
-    y, w = norm * (sensor @ rotation.T)[:, 1:], target[:, 1:]
-    angle = np.arctan2((y[:, 0] * w[:, 1] - y[:, 1] * w[:, 0]).sum(), (y * w).sum())
+    y, z = (sensor @ rotation.T)[:, 1:].T
+    angle = np.arctan2((y * target[:, 2] - z * target[:, 1]).sum(), (y * target[:, 1] + z * target[:, 2]).sum())
     rotation = Rotation.from_rotvec([angle, 0.0, 0.0]).as_matrix() @ rotation
-    for _ in range(20):
-        moved = norm * (sensor @ rotation.T)
-        jacobian = np.zeros((len(moved), 3, 3))
-        jacobian[:, 0, 1], jacobian[:, 0, 2] = moved[:, 2], -moved[:, 1]
-        jacobian[:, 1, 0], jacobian[:, 1, 2] = -moved[:, 2], moved[:, 0]
-        jacobian[:, 2, 0], jacobian[:, 2, 1] = moved[:, 1], -moved[:, 0]
-        columns = jacobian.reshape(-1, 3)
-        length = np.linalg.norm(columns, axis=0)
-        residual = (target - moved).ravel()
-        step = np.linalg.lstsq(columns / length, residual, rcond=None)[0] / length
-        rotation = Rotation.from_rotvec(step).as_matrix() @ rotation
-        if np.abs(step).max() < 4 * EPSILON:
-            break
     # Each product of rotations loses an ulp of orthogonality, which one Newton-Schulz step restores.
     rotation = rotation @ (1.5 * np.eye(3) - 0.5 * rotation.T @ rotation)
-    correlation = ((sensor @ rotation.T) * target).sum()
-    scale = _scale(rule, sensor_power=(sensor**2).sum(), stack_power=(stack**2).sum(), correlation=correlation)
     rotation = axes.T @ rotation
-    return Similarity(np.asarray(scale), rotation, stack_mean - scale * (rotation @ sensor_mean))
+    return Similarity(start.scale, rotation, stack_mean - start.scale * (rotation @ sensor_mean))
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,7 +215,7 @@ def fit_robust(sensor_m: F64, stack_m: F64) -> RobustFit:
         return RobustFit(everything, np.ones(count, bool))
     random = np.random.default_rng(0)
     scored = random.permutation(count)[:MAX_SCORED] if count > MAX_SCORED else np.arange(count)
-    # The points are centred for precision, because the batched fits are not refined.
+    # The points are centred for precision, because the batched fits are only as precise as the cross-covariance.
     half = scored[_best_half(sensor_m[scored] - sensor_m.mean(0), stack_m[scored] - stack_m.mean(0), random=random)]
     limit = float(chi2.ppf(1 - REJECTION_PROBABILITY, 3))
     inlier = np.zeros(count, bool)

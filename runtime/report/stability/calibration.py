@@ -56,7 +56,10 @@ def trials(fits: Mapping[str, Fit]) -> Iterator[Trial]:
         yield Trial(STAGE, f"{rule}: a usual cloud", partial(fitted, solver, cloud()), measure="rad")
     fit = partial(fitted, fits["least-squares"])
     cases: dict[str, Callable[[], Answer]] = {
-        **{f"points 1e-{power} as wide as long": partial(fit, cloud(aspect=10.0**-power)) for power in (0, 1, 3, 5, 7)},
+        **{
+            f"points 1e-{power} as wide as long": partial(fit, cloud(aspect=10.0**-power) @ TURN)
+            for power in (0, 1, 3, 5, 7)
+        },
         **{f"points {metres:g} m from the origin": partial(fit, cloud() + metres) for metres in (1e2, 1e4, 1e6)},
         **{
             f"points within {size:g} m": partial(fit, cloud(size_m=size), offset_m=(size, -size, 2 * size))
