@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from runtime import kernels
 from runtime.errors import MissingPart
+from runtime.kernels import SUBCODE
 from runtime.model import cpu
 from runtime.model.buffers import LayerPool
 from runtime.model.contract import Step
@@ -24,8 +25,9 @@ from runtime.model.geometry import TargetView
 from runtime.model.job import Job, Targets
 from runtime.model.predictor import load_predictor
 from runtime.model.warp import warp
+from runtime.records import F64
 from tests.model.scenes import eyes
-from tests.model.test_steps import STACK, STACKS, begun, panels_of
+from tests.model.test_steps import STACK, STACKS, begun, panels_of, smooth
 
 
 def test_kernels_of_another_version_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -171,6 +173,37 @@ def test_rays_in_any_order_make_the_same_panels(turn: str, channels: int) -> Non
             made.append(np.concatenate([panel.ravel() for panel in panels_of(solving, geometry)]))
     off = np.abs(made[1] - made[0])
     assert off.mean() < 1.5 and np.quantile(off, 0.99) < 8, (off.mean(), np.quantile(off, [0.9, 0.99]))
+
+
+def stepped(rays_from_front: F64, *, upside_down: bool, parts: int = 1) -> NDArray[np.int16]:
+    """(2, 96, 64, 1) panels after a step with one view, whose rays are the rear panel's pixels."""
+    loops, (rows, width) = kernels.library(), (96, 64)
+    turn = np.array([[1, 0, 0], [0, -1, rows], [0, 0, 1.0]]) if upside_down else np.eye(3)
+    picture = smooth(5, 1)[:rows, :width, 0]
+    full = [np.full(size, 32767, np.int16) for size in (width, rows)]
+    table = np.arange(256, dtype=np.int32) * SUBCODE + (8191 << 16)
+    rays = loops.Rays([np.ascontiguousarray(picture[::-1] if upside_down else picture)], *full, table, 2040.0, 0.5)
+    panels = loops.Panels(2, rows, width, 1)
+    for n in range(2):
+        panels.set(n, smooth(n, 1)[:rows, :width, 0].astype(np.int16) * SUBCODE)
+    back = np.linalg.inv(turn) @ [[np.eye(3), rays_from_front]]
+    seen, sets = np.linalg.inv(back), [(0, 0)]
+    problem = loops.Problem(panels, rays, False, [(rows, width)] * 2, seen, back, sets, 1, [False] * 2)
+    for part in range(parts):
+        problem.step(1.0, 0.5, 0.01, part, parts)
+    panels.advance()
+    return np.stack([panels.values(n, rows, width) for n in range(2)])
+
+
+@pytest.mark.parametrize("per_column", [-3.0, -1.5, 0.0])
+@pytest.mark.parametrize("per_row", [-0.3, 0.0])
+@pytest.mark.parametrize("downward", [-0.3, 0.3])
+def test_rows_up_to_a_horizon_meet_all_their_rays(per_column: float, per_row: float, downward: float) -> None:
+    """A panel row whose end lies behind the eye was updated before its last rays had been computed."""
+    rays_from_front = np.array([[1.0, 0.0, 0.0], [downward, 1.0, 0.0], [per_column / 64, per_row / 96, 1.0]])
+    panels = stepped(rays_from_front, upside_down=False)
+    assert np.abs(panels - stepped(rays_from_front, upside_down=True)).max() <= SUBCODE
+    assert (panels == stepped(rays_from_front, upside_down=False, parts=3)).all()
 
 
 @pytest.mark.parametrize("sigma_m", [0.03, 1.66, float("inf")])
