@@ -30,6 +30,7 @@ from runtime.optics.stack import PanelStack
 from runtime.report.pairs import PairPainter, read_pairs
 from runtime.support.artifacts import write_png
 from tests.model.scenes import card_scene
+from tests.optics.test_cameras import parallel, taken
 from tests.test_cli import pair_in, solve_arguments
 from tests.test_extras import of_extras
 
@@ -287,28 +288,6 @@ def test_a_result_prints_in_a_line_and_measures_quality_when_asked(monkeypatch: 
     assert phasestack.__version__[0].isdigit()
 
 
-def scene_at(points_m: np.ndarray) -> np.ndarray:
-    """(h, w, 3) colours of a wavy picture that hangs 1 cm before the stack's middle, at points of that plane."""
-    y, z = points_m[..., 1], points_m[..., 2]
-    waves = [np.sin(60 * y + k) * np.cos(45 * z - k) for k in range(3)]
-    return np.rint(127 + 100 * np.stack(waves, axis=-1)).astype(np.uint8)
-
-
-def taken(matrix: np.ndarray, width_px: int, height_px: int) -> np.ndarray:
-    """A pinhole camera's view of the scene: a plain tracer."""
-    u, v = np.meshgrid(np.arange(width_px) + 0.5, np.arange(height_px) + 0.5)
-    place = -np.linalg.solve(matrix[:, :3], matrix[:, 3])
-    rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(matrix[:, :3]).T
-    return scene_at(place + rays * ((0.01 - place[0]) / rays[..., :1]))
-
-
-def parallel(eye_m: Any, focal_px: float = 330.0) -> np.ndarray:
-    """A camera whose axis is the stack's: it looks along -x, +u to the viewer's right."""
-    axes = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
-    k = np.array([[focal_px, 0, 200], [0, focal_px, 150], [0, 0, 1]])
-    return k @ np.column_stack([axes, -axes @ np.asarray(eye_m)])
-
-
 def test_pictures_of_parallel_cameras_are_solved_for_what_they_are() -> None:
     """Once taken for pictures that look at the middle: 9 dB, reported as 24."""
     eyes_m = ((0.7, -0.05, 0.02), (0.7, 0.05, 0.02))
@@ -555,23 +534,6 @@ def test_the_size_of_ghosts_is_foretold() -> None:
         solved = phasestack.solve(*pictures, eyes_m=eyes, stack=stack)
         with pytest.warns(UserWarning, match="disparity is too large for the panels"):
             assert solved.measure(sigmas_mm=(1,), every=4).light_db["1"] == pytest.approx(foretold_db, abs=2.5)
-
-
-@pytest.mark.parametrize("period_px", [8, 12, 24])
-@pytest.mark.parametrize("sharp", [False, True])
-def test_a_texture_that_repeats_has_no_known_disparity(period_px: int, sharp: bool) -> None:
-    eyes = np.array([(0.6, -0.0315, 0.0), (0.6, 0.0315, 0.0)])
-
-    def texture(shift_px: float) -> np.ndarray:
-        down, across = np.mgrid[:180, :320] * (2 * np.pi / period_px)
-        wave = np.sin(across + 2 * np.pi * shift_px / period_px) + np.sin(down)
-        grey = 128 + 45 * (2 * np.sign(wave) if sharp else wave)
-        return np.repeat(grey.astype(np.uint8)[..., None], 3, axis=2)
-
-    for shift_px in (0, 2, 6):
-        pair = texture(-shift_px / 2), texture(shift_px / 2)
-        assert disparity_doubts(pair, eyes, STACK, fov_deg=40) == []
-    assert disparity_doubts(rectified(60), eyes, STACK, fov_deg=40) != []  # the same blocks only once
 
 
 def test_open_files_are_refused_by_name_and_left_open(tmp_path: Path) -> None:

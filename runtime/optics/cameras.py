@@ -56,6 +56,10 @@ def looking_at_origin(
     turns = [np.diag([1.0, -1.0, -1.0]) @ stack_from_eye(eye_m)[:3, :3].T for eye_m in eyes_m]
     # These matrices map directions (x, y, 1), relative to a gaze at the origin, to picture pixels.
     pixels_from_gaze = [camera[:, :3] @ turn.T for camera, turn in zip(cameras, turns, strict=True)]
+    for n, matrix in enumerate(pixels_from_gaze):
+        if not _within(matrix, np.zeros(2), width, height):
+            name = NAMES[n] if len(pixels_from_gaze) == 2 else f"{n + 1}."
+            raise ValueError(f"the {name} picture does not show the centre of the stack; aim the camera at it")
     pixels_from_gaze = [matrix / matrix[2, 2] for matrix in pixels_from_gaze]
     focal_px = pixels_from_gaze[0][0, 0]
     centred = np.array([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1]])
@@ -71,10 +75,6 @@ def looking_at_origin(
     def shown(share: F64) -> bool:
         return all(_within(matrix, share * extent, width, height) for matrix in pixels_from_gaze)
 
-    for n, matrix in enumerate(pixels_from_gaze):
-        if not _within(matrix, np.zeros(2), width, height):
-            name = NAMES[n] if len(pixels_from_gaze) == 2 else f"{n + 1}."
-            raise ValueError(f"the {name} picture does not show the centre of the stack; aim the camera at it")
     both = _most(lambda share: shown(np.array([share, share])))
     share = np.array([both, both])
     share[0] = _most(lambda wider: shown(np.array([wider, share[1]])), least=both)
