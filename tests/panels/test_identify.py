@@ -178,24 +178,43 @@ def test_the_doctor_refuses_monitors_that_are_mirrored_on_each_other(x: XServer,
     assert failure.startswith("panels 1 and 2 would show the same pixels")
 
 
-def test_a_card_has_edges_bars_steps_an_arrow_and_text() -> None:
-    card = identity_card(1600, 900, title="0", lines=["long " * 40, "1"])
-    assert card.shape == (900, 1600, 4) and (card[..., 3] == 255).all()
+CARDS = {
+    (1600, 900): {  # rows and columns of a region, and those of the ink
+        (30, 240, 30, 1100): (108, 239, 204, 295),  # title
+        (262, 347, 30, 1130): (331, 339, 193, 1083),  # a long line fills its room
+        (350, 600, 30, 1100): (368, 415, 202, 217),  # the next line
+        (30, 585, 1130, 1275): (107, 576, 1159, 1274),  # arrow
+        (232, 400, 1284, 1500): (288, 344, 1291, 1385),  # UP
+        (594, 675, 1130, 1500): (602, 641, 1162, 1363),  # RIGHT
+    },
+    (900, 1600): {
+        (200, 450, 30, 540): (290, 421, 120, 211),
+        (500, 530, 30, 680): (516, 520, 108, 609),
+        (540, 800, 30, 540): (550, 597, 118, 133),
+        (120, 1030, 540, 870): (198, 1017, 540, 852),
+        (500, 650, 730, 870): (554, 610, 745, 839),
+        (1030, 1150, 540, 870): (1043, 1082, 616, 817),
+    },
+}
+
+
+@pytest.mark.parametrize("size_px", CARDS)
+def test_a_card_has_edges_bars_steps_an_arrow_and_text(size_px: tuple[int, int]) -> None:
+    width, height = size_px
+    card = identity_card(width, height, title="0", lines=["long " * 40, "1"])
+    assert card.shape == (height, width, 4) and (card[..., 3] == 255).all()
     ink = card[..., :3].min(-1) > 130
-    assert ink[[0, -1]].all() and ink[:, [0, -1]].all()
+    assert ink[[0, -1]].all() and ink[:, [0, -1]].all() and not ink[1, 1:-1].any() and not ink[1:-1, 1].any()
     assert (card[[27, -28], 27:-27, :3] == (120, 130, 150)).all() and (card[27:-27, [27, -28], 0] == 120).all()
-    bars = card[700, [1600 * (2 * n + 1) // 14 for n in range(7)], :3]
-    assert list(map(tuple, bars.tolist())) == list(BARS)
-    assert card[850, 50::100, 0].tolist() == [17 * step for step in range(16)]
-    for region, expected in {  # rows and columns, and those of the ink
-        (30, 240, 30, 1100): (108, 234, 203, 296),  # title
-        (262, 347, 30, 1130): (331, 338, 192, 1088),  # a long line fills its room
-        (350, 600, 30, 1100): (369, 414, 203, 217),  # the next line
-        (30, 585, 1130, 1275): (117, 572, 1158, 1275),  # arrow
-        (232, 400, 1284, 1500): (288, 342, 1288, 1386),  # UP
-        (594, 675, 1130, 1500): (603, 639, 1162, 1365),  # RIGHT
-    }.items():
+    assert (card[[26, 28], 400, :3] == card[2, 2, :3]).all() and (card[400, [26, 28], :3] == card[2, 2, :3]).all()
+    bars = ["ff0000", "00ff00", "0000ff", "00ffff", "ff00ff", "ffff00", "ffffff"]
+    for row, colours in ((0.77, bars), (0.87, bars), (0.89, [f"{17 * n:02x}" * 3 for n in range(16)])):
+        count = len(colours)
+        for side in (30, -3):  # columns from the edges of a bar
+            columns = [width * (n + (side < 0)) // count + side for n in range(count)]
+            assert [bytes(pixel).hex() for pixel in card[round(row * height), columns, :3]] == colours
+    for region, expected in CARDS[size_px].items():
         top, bottom, left, right = region
         rows, columns = (np.flatnonzero(ink[top:bottom, left:right].any(axis)) for axis in (1, 0))
         found = [top + rows[0], top + rows[-1], left + columns[0], left + columns[-1]]
-        assert found == pytest.approx(expected, abs=11), region
+        assert found == pytest.approx(expected, abs=2), region
