@@ -16,6 +16,7 @@ from runtime.config import PanelSettings
 from runtime.errors import PanelLost
 from runtime.optics.stack import PanelStack
 from runtime.panels import window
+from runtime.panels.card import identity_card
 from runtime.panels.display import glfw
 from runtime.panels.drawing import WindowContextLost
 from runtime.panels.monitors import Monitor, Rectangle
@@ -37,7 +38,7 @@ class Screen:
         self.failure: Exception | None = None
         self.windows = [SimpleNamespace(handle=n, shown=True, place=self.connected[n].place) for n in range(2)]
         self.root = SimpleNamespace(make_current=lambda: None)
-        self.context: Any = SimpleNamespace(__enter__=lambda: self.done.append("context"))
+        self.context: Any = type("Context", (), {"__enter__": lambda _: self.done.append("context")})()
 
     def opened(self, *_given: Any, **_how: Any) -> Screen:
         self.done.append("open")
@@ -93,9 +94,7 @@ def started(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Screen, Wind
         monkeypatch.setattr(window, "Display", lambda: screen.done.append("display") or screen)
         monkeypatch.setattr(window, "open_windows", screen.opened)
         monkeypatch.setattr(window, "glfw", SimpleNamespace(poll_events=lambda: None, GLFWError=glfw.GLFWError))
-        context: Any = type("Context", (), {"__enter__": lambda _: screen.done.append("context")})()
-        sink = WindowPanels(PANELS, STACK, screen.clock, context)
-        return screen, sink
+        return screen, WindowPanels(PANELS, STACK, screen.clock, screen.context)
 
     return start
 
@@ -209,3 +208,19 @@ def test_windows_and_monitors_are_asked_in_turn_within_a_second(
         assert sink.present(frame(number)).number == number
         screen.clock.advance_ns((1 if number == 0 else 250) * NS_PER_MS)
     assert lost(sink) == told if told else sink.present(frame(9))
+
+
+def test_every_monitor_gets_a_card_with_its_setting(started: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    screen, _ = started()
+    named = replace(screen.connected[0], serial="A1", model="EIZ CG27")
+    screen.connected = [named, replace(screen.connected[1], width_px=1280, height_px=1440)]
+    monkeypatch.setattr(window, "connected_monitors", screen.monitors)
+    monkeypatch.setattr(window, "offscreen_context", lambda: screen.context)
+    sink, cards, monitors = window.every_monitor()
+    assert list(monitors) == screen.connected == list(sink.monitors)
+    for card, title, *lines in (
+        (cards[0], "DP-0", "EIZ CG27", "1920 x 1080", 'edid_serial = "A1"'),
+        (cards[1], "DP-1", "(the EDID has no name)", "1280 x 1440", 'connector = "DP-1"'),
+    ):
+        lines[2:2] = ["in the configuration:", "[[output.panels]]"]
+        assert np.array_equal(card, identity_card(1920, 1440, title=title, lines=lines))
