@@ -119,6 +119,25 @@ def test_the_origin_along_x_is_anybodys_choice(
         np.testing.assert_allclose(a, b, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("first_m", "second_m", "common_m"),
+    [
+        ((0.01, 0.02, -0.02), (0.03, 0.01, -0.01), (0.01, 0.01, -0.01)),
+        ((0.01, 0.02, -0.02), (0.0, -0.02, 0.03), (0.0, 0.0, 0.0)),
+        ((-0.03, 0.0, 0.01), (-0.02, 0.01, 0.01), (-0.02, 0.0, 0.01)),
+    ],
+)
+def test_people_are_followed_as_far_as_all_of_them_move(first_m: Any, second_m: Any, common_m: Any) -> None:
+    """Each turns the head as well, which moves no midpoint."""
+    people = np.concatenate([HEAD, HEAD + np.array([0.1, 0.4, 0.05])])
+    turned = [[0.002, 0, 0.001], [-0.002, 0, -0.001]] * 2
+    now = people + np.repeat([first_m, second_m], 2, axis=0) + turned
+    aligned, expected = (align(STACK, solved_for_m=people, eyes_m=eyes) for eyes in (now, people + common_m))
+    assert same(aligned, expected) and not aligned.limited
+    single = HEAD + np.array([0.05, 0.2, 0.025])  # in the middle between them
+    assert same(aligned, align(STACK, solved_for_m=single, eyes_m=single + common_m))
+
+
 # Limits.
 
 
@@ -151,12 +170,20 @@ def test_eyes_that_are_nowhere_leave_the_layers_as_they_are(bad: float) -> None:
     assert all(np.array_equal(matrix, np.eye(3)) for matrix in behind.solved_from_shown) and behind.limited
 
 
-@pytest.mark.parametrize("x_m", [-1.0, 0.0, 0.06, 0.069])
-def test_an_eye_at_the_front_panel_is_held_at_the_nearest_place(x_m: float) -> None:
+@pytest.mark.parametrize(
+    ("side", "x_m", "told"),
+    [
+        (0, -1.0, "the left eye is -1.06 m from the front panel, but the minimum is 0.01 m"),
+        (1, 0.0, "the right eye is -0.06 m from the front panel"),
+        (0, 0.06, "the left eye is 0 m from"),
+        (1, 0.069, "the right eye is 0.009 m from"),
+    ],
+)
+def test_an_eye_at_the_front_panel_is_held_at_the_nearest_place(side: int, x_m: float, told: str) -> None:
     new = HEAD.copy()
-    new[0, 0] = x_m
+    new[side, 0] = x_m
     aligned = align(STACK, solved_for_m=HEAD, eyes_m=new)
-    assert "left eye" in aligned.limited and "front panel" in aligned.limited
+    assert told in aligned.limited
     share = (0.6 - 0.06 - 0.01) / (0.6 - x_m)  # a centimetre in front of the front panel
     nearest = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + share * (1 - 1e-12) * (new - HEAD))
     assert nearest.limited == ""

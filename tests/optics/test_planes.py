@@ -8,7 +8,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from runtime.optics.rect import PixelRect
+from runtime.optics.rect import PixelRect, union
 from runtime.optics.stack import PanelStack, Plane, between_pixel_centres
 from tests.optics import reference
 from tests.optics.strategies import eyes, floats, stacks
@@ -70,6 +70,8 @@ def test_a_cropped_raster_is_projected_from_its_own_corner(
     np.testing.assert_allclose(
         applied(cropped.to(front, eye), 2.5, 3.5), applied(rear.to(front, eye), left + 2.5, top + 3.5), atol=1e-8
     )
+    for one, other in ((cropped, front), (front, cropped)):  # in plain floats
+        np.testing.assert_allclose(one.to_from(other, eye.tolist()), one.to(other, eye), rtol=1e-9, atol=1e-9)
 
 
 @given(eyes(), eyes(), stacks())
@@ -107,3 +109,42 @@ def test_opencv_finds_the_pixel_centre_that_a_homography_names(
     ]
     expected = np.clip(applied(source_from_target, column + 0.5, row + 0.5) - 0.5, 0, 7)
     np.testing.assert_allclose(found, expected, atol=1 / 32 + 1e-6)  # OpenCV's positions are multiples of 1/32
+
+
+@pytest.mark.parametrize(
+    ("size_px", "by", "expected"),
+    [((1920, 1080), 3, (640, 360)), ((10, 7), 4, (2, 2)), ((3, 2), 8, (1, 1)), ((11, 5), 1, (11, 5))],
+)
+def test_a_reduced_stack_has_at_least_one_pixel(size_px: tuple[int, int], by: int, expected: tuple[int, int]) -> None:
+    whole = PanelStack(0.5, 0.3, (-0.06, 0.06), *size_px, colour=(True, False))
+    assert whole.reduced(by) == PanelStack(0.5, 0.3, (-0.06, 0.06), *expected, colour=(True, False))
+    assert [whole.is_grey(n) for n in (0, 1)] == [False, True] and not PanelStack(1, 1, (0.0,), 1, 1).is_grey(0)
+
+
+@pytest.mark.parametrize(
+    ("x_m", "is_even"),
+    [
+        ((0.0,), True),
+        ((0.0, 0.1), True),
+        ((0.0, 0.1, 0.216), True),
+        ((0.0, 0.1, 0.217), False),
+        ((0.0, 0.117, 0.217), False),
+    ],
+)
+def test_gaps_that_differ_by_up_to_15_percent_are_even(x_m: tuple[float, ...], is_even: bool) -> None:
+    assert PanelStack(0.5, 0.3, x_m, 64, 36).is_evenly_spaced == is_even
+
+
+@given(st.integers(-2, 6), st.integers(-2, 6), st.integers(-2, 8), st.integers(-2, 8), st.integers(1, 4))
+def test_a_rectangle_and_those_beside_it_cover_a_raster_once(u0: int, v0: int, u1: int, v1: int, rows: int) -> None:
+    box = PixelRect(*np.clip([u0, v0, u1, v1], 0, 6).tolist())
+    covered = np.zeros((6, 6), int)
+    for part in [*box.in_rows(rows), *box.beside(width_px=6, height_px=6)]:
+        covered[part.slices] += 1
+    filled = box.u1 > box.u0 and box.v1 > box.v0
+    assert (covered == 1).all()
+    assert all(part.height_px <= rows for part in box.in_rows(rows))
+    assert (box.width_px, box.height_px) == (max(box.u1 - box.u0, 0), max(box.v1 - box.v0, 0))
+    around = union([PixelRect(1, 5, 3, 6), box, PixelRect(4, 9, 4, 12)])
+    both = (min(1, box.u0), min(5, box.v0), max(3, box.u1), max(6, box.v1))
+    assert around.corners == (both if filled else (1, 5, 3, 6)) and union([]).corners == (0, 0, 0, 0)
