@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from runtime.optics import carried
-from runtime.optics.carried import carried_db, expected_psnrs_db
+from runtime.optics.carried import carried_db, expected_psnrs_db, standard_error_db
 from runtime.optics.light import LIGHT, ONE_RAY, Sampling
 from runtime.optics.quality import quality
 from runtime.optics.retina import seen_by
@@ -119,3 +119,8 @@ def test_a_true_eye_that_sees_nothing_of_the_panels_is_refused(place: list[float
     layers, pictures, eyes = case(STACKS[0], 5)
     with pytest.raises(ValueError, match=told):
         carried_db(layers, pictures, STACKS[0], solved_for_m=eyes, eyes_m=[place, place], fov_deg=30)
+
+
+def test_a_standard_error_is_that_of_the_mean_of_groups() -> None:
+    assert standard_error_db(np.array([0.01, 0.008, 0.012, 0.01, 0.01])) == pytest.approx(0.35459, abs=1e-5)
+    assert standard_error_db(np.array([0.0, 0.0, 0.0])) == 0.0

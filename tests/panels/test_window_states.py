@@ -224,3 +224,12 @@ def test_every_monitor_gets_a_card_with_its_setting(started: Any, monkeypatch: p
     ):
         lines[2:2] = ["in the configuration:", "[[output.panels]]"]
         assert np.array_equal(card, identity_card(1920, 1440, title=title, lines=lines))
+
+
+def test_a_monitor_in_another_mode_is_refused_and_nothing_stays_open(started: Any) -> None:
+    screen, _ = started()
+    did(screen)
+    screen.connected[1] = replace(screen.connected[1], width_px=1280)
+    with pytest.raises(PanelLost, match="panel 1: DP-1 shows 1280x1080"):
+        WindowPanels(PANELS, STACK, screen.clock, screen.context)
+    assert did(screen) == ["display", "close display", "context"]
