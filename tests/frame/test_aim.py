@@ -15,7 +15,6 @@ from runtime.config import Settings
 from runtime.frame import aim
 from runtime.frame.aim import Aim, Slots, focused
 from runtime.frame.effort import Costs, EffortChooser, Outlook, simulated_costs
-from runtime.frame.messages import Facts
 from runtime.frame.viewer import Viewer
 from runtime.model.solver import FOCUS_STEPS
 from runtime.records import Effort, EyesEstimate, EyesLabel, FrameTiming, Measures, Solution, SolveRequest
@@ -59,7 +58,6 @@ def test_a_resting_head_s_finished_solution_gets_focus_if_time_allows(
 
 NOW_NS, REFRESH_NS = 2 * NS_PER_S, 20 * NS_PER_MS
 PHOTON_NS = NOW_NS + 30 * NS_PER_MS
-FAR_NS = 125 * NS_PER_MS  # the eyes are predicted no farther ahead
 
 
 class Looking:
@@ -76,35 +74,30 @@ class Looking:
 class Busy(FakeSolver):
     """A solver that is free at some time, and whose model offers more."""
 
-    def __init__(self, *, free_ms: float = 0.0, cost_ms: float = 20.0, **offered: Any) -> None:
-        super().__init__(cost_ns=round(cost_ms * NS_PER_MS))
+    def __init__(self, *, free_ms: float = 0.0, cost_ms: float = 20.0, step_ms: float = 0.0, **offered: Any) -> None:
+        super().__init__()
         self.free_ms, self.offers = free_ms, {"steps": 4, "refined_steps": 8, "reductions": (1,), **offered}
-        self.reductions, self.step_ms = self.offers["reductions"], 0.0
+        self.reductions, self.stage_ms = self.offers["reductions"], {"inference": cost_ms, "step": step_ms}
 
-    @property
-    def costs(self) -> Costs:
-        return simulated_costs({"inference": self.solve_cost_ns / NS_PER_MS, "step": self.step_ms}, self.reductions)
-
-    @property
-    def facts(self) -> Facts:
-        return facts(self.settings, **self.offers)
+    costs = property(lambda self: simulated_costs(self.stage_ms, self.reductions))
+    facts = property(lambda self: facts(self.settings, **self.offers))
 
     def free_ns(self, now_ns: int) -> int:
         return NOW_NS + round(self.free_ms * NS_PER_MS)
 
 
 class Recorded(EffortChooser):
-    """A chooser of efforts that keeps what it was asked, and always gives the first one unless it is free."""
+    """A chooser of efforts that keeps what it was asked, and always gives the first one."""
 
     made: ClassVar[list[Recorded]] = []
 
     def __init__(self) -> None:
         super().__init__()
-        self.asked: list[tuple[Callable[[float], Outlook], float, float, float]] = []
+        self.asked: list[dict[str, Any]] = []
         self.made.append(self)
 
     def choose(self, efforts: list[Effort], costs: Costs, outlook: Any, **how: float) -> Effort:  # type: ignore[override]
-        self.asked.append((outlook, how["shown_error"], how["horizon_s"], how["period_ms"]))
+        self.asked.append({"outlook": outlook, **how})
         return efforts[0]
 
 
@@ -123,16 +116,16 @@ class Aiming:
 
     def request(self, shown: Solution | None = None, *, later_s: float = 0.0, **settings: Any) -> SolveRequest:
         timing = FrameTiming(1, NOW_NS, NOW_NS + REFRESH_NS, PHOTON_NS + round(later_s * NS_PER_S))
-        return self.aim.request(
-            timing,
-            self.viewer.eyes(1e3 * later_s),
-            shown,
-            Settings.model_validate(settings),
-            composed_ns=NOW_NS,
-            now_ns=NOW_NS,
-            flat_wanted=False,
-            paused=False,
-        )
+        eyes, times = self.viewer.eyes(1e3 * later_s), {"composed_ns": NOW_NS, "now_ns": NOW_NS}
+        told = Settings.model_validate(settings)
+        return self.aim.request(timing, eyes, shown, told, **times, flat_wanted=False, paused=False)
+
+    def outlook(self, eyes: Callable[[float], EyesEstimate], *, cost_ms: float = 20.0, requests: int = 1) -> Outlook:
+        """The outlook after so many requests for these eyes."""
+        self.viewer.eyes = eyes
+        for _ in range(requests):
+            self.request()
+        return cast(Outlook, self.chooser.asked[-1]["outlook"](cost_ms))
 
 
 def seen(*places_m: Any, sigma_mm: float = 1.0, label: EyesLabel = "predicted", first: int = 1) -> EyesEstimate:
@@ -196,97 +189,66 @@ def test_eyes_are_predicted_an_eighth_of_a_second_ahead_at_most() -> None:
     assert request.eyes_m == pytest.approx(EYES) and request.people == (1,), "another person's eyes are not taken"
 
 
-@pytest.mark.parametrize(
-    ("eyes", "settings", "fixed", "effort"),
-    [
-        (walking(0.0), {}, None, Effort(2, 0)),
-        (walking(0.0), {"model": {"effort": "full"}}, None, Effort(1, 4)),
-        (walking(0.0), {"model": {"effort": "full"}}, Effort(2, 3), Effort(2, 3)),
-        (lambda ms: seen(), {}, None, Effort(1, 4)),
-    ],
-)
-def test_an_effort_is_chosen_for_a_viewer_unless_it_is_fixed(
-    eyes: Any, settings: Any, fixed: Effort | None, effort: Effort
-) -> None:
-    aiming = Aiming(eyes, fixed=fixed, reductions=(2, 3))
-    assert aiming.request(**settings).effort == effort
+def test_an_effort_is_chosen_for_a_viewer_unless_it_is_fixed() -> None:
+    full: dict[str, Any] = {"model": {"effort": "full"}}
+    assert Aiming(walking(0.0), reductions=(2, 3)).request().effort == Effort(2, 0)
+    assert Aiming(walking(0.0), reductions=(2, 3)).request(**full).effort == Effort(1, 4)
+    assert Aiming(walking(0.0), fixed=Effort(2, 3)).request(**full).effort == Effort(2, 3)
+    assert Aiming(lambda ms: seen(), reductions=(2, 3)).request().effort == Effort(1, 4)
 
 
 def test_a_lost_head_keeps_its_effort_while_the_model_has_it() -> None:
-    label: list[EyesLabel] = ["held"]
-    aiming = Aiming(lambda ms: seen((0, 0, 0), label=label[0]), reductions=(2, 3))
-    assert aiming.request().effort == Effort(2, 0), "it was never seen"
-    aiming.solver.offers["reductions"] = aiming.solver.reductions = (3, 2)
-    assert aiming.request().effort == Effort(2, 0)
-    aiming.solver.offers["reductions"] = aiming.solver.reductions = (3,)
-    assert aiming.request().effort == Effort(3, 0)
-    aiming.solver.offers["reductions"] = aiming.solver.reductions = (2, 3)
-    label[0] = "predicted"
-    assert aiming.request().effort == Effort(2, 0)
+    aiming = Aiming(walking(0.0), reductions=(2, 3))
+
+    def reduction(*offered: int, label: EyesLabel = "held") -> int:
+        aiming.viewer.eyes = walking(0.0, label=label)
+        aiming.solver.offers["reductions"] = aiming.solver.reductions = offered
+        effort = aiming.request().effort
+        return 0 if effort is None else effort.reduction
+
+    assert [reduction(2, 3), reduction(3, 2), reduction(3), reduction(2, 3)] == [2, 2, 3, 3]
+    assert reduction(2, 3, label="predicted") == 2
     aiming.solver.reductions = (3,)  # there are no times yet for the other raster
     assert aiming.request().effort == Effort(3, 0)
 
 
 def test_the_outlook_has_the_speed_and_a_deviation_that_grows() -> None:
-    aiming = Aiming(walking(1.0))
-    aiming.request()
-    outlook, _, horizon_s, period_ms = aiming.chooser.asked[0]
-    soon, late = outlook(20.0), outlook(100.0)  # shown at 20 ms, and from 100 to 180 ms
+    soon, late = (Aiming(walking(1.0)).outlook(walking(1.0), cost_ms=cost_ms) for cost_ms in (20.0, 100.0))
     speed_m_s = (0.020**2 - 2 * 0.001**2) ** 0.5 / 0.020  # some of the movement may be an error
-    assert (soon.speed_m_s, late.speed_m_s) == pytest.approx((speed_m_s, speed_m_s))
-    assert (soon.sigma_m, late.sigma_m) == pytest.approx((0.002, 0.008))
-    assert (soon.lag_m, late.lag_m) == pytest.approx((0.0, 0.015 * speed_m_s)), "beyond the prediction"
-    assert (horizon_s, period_ms) == (1.0, 20.0)
-
-
-def test_errors_of_two_people_count_three_times() -> None:
-    aiming = Aiming(lambda ms: seen((0, ms / 1e3, 0), (0, 0.5 + ms / 1e3, 0), sigma_mm=1 + ms / 20))
-    aiming.request()
-    outlook = aiming.chooser.asked[0][0](20.0)
-    assert outlook.sigma_m == pytest.approx(0.006)
-    assert outlook.speed_m_s == pytest.approx((0.020**2 - 2 * 0.003**2) ** 0.5 / 0.020)
+    assert soon == Outlook(pytest.approx(0.002), pytest.approx(speed_m_s), 0.0)
+    lag_m = 0.015 * speed_m_s  # it is shown from 100 to 180 ms, and eyes are predicted 125 ms ahead
+    assert late == Outlook(pytest.approx(0.008), pytest.approx(speed_m_s), pytest.approx(lag_m))
+    both = Aiming(walking(1.0)).outlook(lambda ms: seen((0, ms / 1e3, 0), (0, 0.5 + ms / 1e3, 0), sigma_mm=1 + ms / 20))
+    speed_m_s = (0.020**2 - 2 * 0.003**2) ** 0.5 / 0.020
+    assert both == Outlook(pytest.approx(0.006), pytest.approx(speed_m_s), 0.0), "errors count three times for two"
 
 
 def test_a_resting_head_has_no_error_a_lost_one_its_usual_speed() -> None:
     aiming = Aiming(walking(1.0))
-    for _ in range(100):
-        aiming.request()
-    usual_m_s = aiming.chooser.asked[-1][0](20.0).speed_m_s
-    aiming.viewer.eyes = walking(0.0)  # at a turning point
-    aiming.request()
-    assert 0.95 * usual_m_s < aiming.chooser.asked[-1][0](20.0).speed_m_s < usual_m_s
-    aiming.viewer.eyes = lambda ms: seen((0, 0, 0), sigma_mm=5.0) if ms <= 0 else seen()
-    aiming.request()
-    outlook = aiming.chooser.asked[-1][0](20.0)
-    assert 0.95 * usual_m_s < outlook.speed_m_s < usual_m_s and (outlook.sigma_m, outlook.lag_m) == (0.005, 0.0)
-    aiming.viewer.eyes = walking(0.0, label="rested")
-    aiming.request()
-    assert aiming.chooser.asked[-1][0](200.0) == Outlook()
-    aiming.viewer.eyes = lambda ms: seen((0, 0, 0)) if ms <= 0 else seen()
-    aiming.request()
-    assert aiming.chooser.asked[-1][0](20.0).speed_m_s == 0.0, "a head that rested has no usual speed"
+    usual_m_s = aiming.outlook(walking(1.0), requests=100).speed_m_s
+    assert 0.95 * usual_m_s < aiming.outlook(walking(0.0)).speed_m_s < usual_m_s, "at a turning point"
+    lost = aiming.outlook(lambda ms: seen((0, 0, 0), sigma_mm=5.0) if ms <= 0 else seen())
+    assert 0.95 * usual_m_s < lost.speed_m_s < usual_m_s and (lost.sigma_m, lost.lag_m) == (0.005, 0.0)
+    assert aiming.outlook(walking(0.0, label="rested"), cost_ms=200.0) == Outlook()
+    assert aiming.outlook(lambda ms: seen((0, 0, 0)) if ms <= 0 else seen()).speed_m_s == 0.0, "it has rested since"
 
 
 def test_the_usual_speed_follows_a_head_within_half_a_second() -> None:
     aiming = Aiming(walking(1.0, least_mm=0.0))
-    for _ in range(13):
-        aiming.request()
-    aiming.viewer.eyes = walking(0.0, label="held")  # where it was seen last, which is no standing still
-    for _ in range(20):
-        aiming.request()
-    aiming.viewer.eyes = lambda ms: seen((0, 0, 0)) if ms <= 0 else seen()
-    aiming.request()
-    assert aiming.chooser.asked[-1][0](20.0).speed_m_s == pytest.approx(0.40**0.5, rel=0.01), "of 0.26 s"
+    aiming.outlook(walking(1.0, least_mm=0.0), requests=13)
+    aiming.outlook(walking(0.0, label="held"), requests=20)  # where it was seen last, which is no standing still
+    lost = aiming.outlook(lambda ms: seen((0, 0, 0)) if ms <= 0 else seen())
+    assert lost.speed_m_s == pytest.approx(0.40**0.5, rel=0.01), "of 0.26 s"
 
 
 def test_a_calm_head_is_expected_to_stay_calm_as_long_again() -> None:
     aiming = Aiming(walking(0.0))
-    horizons = []
     for later_s, m_s in ((0.0, 0.019), (0.5, 0.019), (3.0, 0.019), (3.5, 0.021), (4.0, 0.019), (4.5, 0.019)):
         aiming.viewer.eyes = lambda ms, m_s=m_s: seen((0.0, m_s * ms / 1e3, 0.0), sigma_mm=0.0)
         aiming.request(later_s=later_s)
-        horizons.append(aiming.chooser.asked[-1][2])
+    horizons = [asked["horizon_s"] for asked in aiming.chooser.asked]
     assert horizons == pytest.approx([1.0, 1.5, 4.0, 1.0, 1.0, 1.5], abs=0.001)
+    assert aiming.chooser.asked[0]["period_ms"] == 20.0
 
 
 @pytest.mark.parametrize(
@@ -304,7 +266,7 @@ def test_the_shown_error_is_a_stale_view_s_or_that_without_picture(places: Any, 
     aiming.chooser.pictures.rate_s2 = 0.5
     held = None if shown is None else solution(1, time_ns=PHOTON_NS - 100 * NS_PER_MS, **shown)
     aiming.request(held)
-    assert aiming.chooser.asked[-1][1] == pytest.approx(error, rel=1e-3)
+    assert aiming.chooser.asked[-1]["shown_error"] == pytest.approx(error, rel=1e-3)
 
 
 def test_measures_are_learned_once_and_displacements_unless_eyes_are_held() -> None:
@@ -312,14 +274,11 @@ def test_measures_are_learned_once_and_displacements_unless_eyes_are_held() -> N
     pictures, foresight = aiming.chooser.pictures, aiming.chooser.foresight
     aiming.viewer.eyes = lambda ms: seen((0, 0, 0), sigma_mm=1.0)  # 2 mm² are expected
     request = aiming.request()
-    for moved_mm, label, when_ns, scale in (
-        (1.0, "held", request.time_ns, 1.0),
-        (1.0, "predicted", request.time_ns + 1, 1.0),  # nothing was asked for at that time
-        (1.0, "predicted", request.time_ns, 0.5),
-    ):
-        aiming.viewer.eyes = lambda ms, y_m=moved_mm / 1e3, label=label: seen((0, y_m, 0), label=label)
+    cases: tuple[tuple[EyesLabel, int, float], ...] = ("held", 0, 1.0), ("predicted", 1, 1.0), ("predicted", 0, 0.5)
+    for label, off_ns, scale in cases:  # nothing was asked for a nanosecond later
+        aiming.viewer.eyes = lambda ms, label=label: seen((0, 0.001, 0), label=label)
         measures = Measures(residual=2e-3 if pictures.residual == 1e-3 else 9e-3)
-        aiming.request(solution(3, time_ns=when_ns, measures=measures))
+        aiming.request(solution(3, time_ns=request.time_ns + off_ns, measures=measures))
         assert foresight.scale == pytest.approx(scale)
         assert pictures.residual == 2e-3, "the third solution's measures count once"
 
@@ -350,8 +309,7 @@ def test_expectations_of_the_last_256_requests_are_kept() -> None:
 def test_a_resting_head_s_solution_is_refined_while_it_gains(
     done: Effort, step_ms: float, most: int, refined: Effort | None
 ) -> None:
-    aiming = Aiming(walking(0.0, label="rested"), reductions=(1, 2), refined_steps=most)
-    aiming.solver.step_ms = step_ms
+    aiming = Aiming(walking(0.0, label="rested"), reductions=(1, 2), refined_steps=most, step_ms=step_ms)
     off = {"content": {"focus": "off"}}
     shown = solution(1, time_ns=PHOTON_NS, effort=done)
     assert aiming.request(shown, **off).refined_to == refined

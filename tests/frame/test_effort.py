@@ -321,7 +321,8 @@ def test_time_that_belongs_to_no_stage_is_the_latest_solution_s() -> None:
 
 
 def test_costs_without_any_times_are_nothing() -> None:
-    for first in ({1: {}}, {1: {"render": 0.0}, 2: {"render": 0.0}}):
+    nothing: dict[int, dict[str, float]] = {1: {}}
+    for first in (nothing, {1: {"render": 0.0}, 2: {"render": 0.0}}):
         book = CostBook(first)
         book.learn(Effort(1, 0), {})
         assert book.costs().ms(Effort(1, 0)) == book.costs().ms(Effort(2, 0)) == 0.0

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from runtime.clock import NS_PER_MS, NS_PER_S, MonotonicClock
-from runtime.frame.aim import HORIZON_NS
 from runtime.optics.alignment import align
 from runtime.plan.savings import selected_eyes
 from runtime.records import State
@@ -370,31 +369,6 @@ def test_no_refresh_waits_for_the_solver() -> None:
     assert ages == pytest.approx(PERIOD_NS / NS_PER_MS, abs=0.01)  # and it says how old the solution is
 
 
-# --- requests to the solver ------------------------------------------------------------------------------------
-
-
-def test_eyes_are_requested_for_the_middle_of_the_solution_s_showing(
-    stage: Stage,
-) -> None:
-    stage.eyes = moves
-    for cost_ms in (1, 20, 60):
-        stage.solver.solve_cost_ns = cost_ms * NS_PER_MS
-        (done,) = stage.refresh()
-        request = stage.solver.requests[-1]
-        first = max(1, -(-stage.solver.solve_cost_ns // PERIOD_NS))
-        last = max(first, -(-2 * stage.solver.solve_cost_ns // PERIOD_NS) - 1)
-        assert request.time_ns == pytest.approx(
-            done.account.predicted_for_ns + (first + last) * PERIOD_NS / 2, abs=PERIOD_NS / 100
-        )
-        reached_ns = min(request.time_ns, done.account.predicted_for_ns + HORIZON_NS)
-        ahead_m = stage.viewer.ahead(reached_ns).eyes_m
-        # Not all of the way where the tracker does not know it.
-        way, gone = ((eyes_m - done.account.eyes_m).mean(axis=0) for eyes_m in (ahead_m, request.eyes_m))
-        assert 0.0 <= float(gone @ way) <= float(way @ way) * 1.0001
-        np.testing.assert_allclose(np.cross(gone, way), 0.0, atol=1e-12)
-        assert request.sigma_m * 1000 == pytest.approx(done.account.eye_sigma_mm)
-
-
 # --- accounts ----------------------------------------------------------------------------------------------------
 
 
@@ -486,18 +460,6 @@ def test_a_display_of_a_few_hertz_stops_no_refresh(monkeypatch: pytest.MonkeyPat
     stage.eyes = moves
     stage.refresh(20)
     assert stage.solver.requests[-1].eyes_m is not None
-
-
-def test_a_calm_head_gets_longer_solutions_within_a_second() -> None:
-    """The longer a head has been calm, the less it matters that panels cannot answer while a solution is computed."""
-    stage = Stage()
-    stage.solver.offered = stage.solver.reductions = (1, 2, 3, 4)
-    stage.solver.solve_cost_ns = 600 * NS_PER_MS
-    stage.eyes = lambda time_s: aside(0.002 * np.sin(2 * time_s))
-    stage.refresh(HZ)
-    asked = [request.effort.reduction for request in stage.solver.requests]
-    assert asked[HZ // 3] > 2
-    assert asked[-1] == 2
 
 
 def test_a_head_that_has_rested_counts_as_one_that_never_moved() -> None:

@@ -69,11 +69,14 @@ class Hosting:
 
     def stepped(self, number: int | None = None, *, took_ms: float = 20.0, flat: int | None = None) -> None:
         """The solver has worked for so long, and perhaps made a solution or a flat picture."""
-        made = [None if n is None else solution(n, *([None] * (n == flat))) for n in (number, flat)]
-        places = [None if one is None else self.slots.hand_over(one.layers) for one in made]
-        slots = [None if place is None else m.Slot(*place) for place in places]
-        update, took_ns = m.SolverUpdate(*made, {"content": "busy"}), round(took_ms * NS_PER_MS)
-        self.worker.messages.append(m.Stepped(update, *slots, took_ns, COSTS, m.Live(), ContentInfo("next")))
+        solved = None if number is None else solution(number)
+        drawn = None if flat is None else solution(flat, None)
+        slot, flat_slot = (
+            m.Slot(*place) if made is not None and (place := self.slots.hand_over(made.layers)) else None
+            for made in (solved, drawn)
+        )
+        update, took_ns = m.SolverUpdate(solved, drawn, {"content": "busy"}), round(took_ms * NS_PER_MS)
+        self.worker.messages.append(m.Stepped(update, slot, flat_slot, took_ns, COSTS, m.Live(), ContentInfo("next")))
 
     def late(self, *, after_ms: float = 0.0) -> str:
         self.clock.advance_ns(round(after_ms * NS_PER_MS))
