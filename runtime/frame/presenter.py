@@ -199,9 +199,7 @@ class Presenter:
         """Return the frame to present, and the reason if the alignment has reached a limit, otherwise ""."""
         solution, flat = news.solution, news.flat
         target = 1.0 if eyes.eyes_m is None or self.flat_asked else 0.0
-        if solution is None:
-            self._flatness.value = 1.0
-        elif not self._drew_solution and target == 0.0:
+        if solution is not None and not self._drew_solution and target == 0.0:
             self._flatness.value = 0.0  # show the first picture without fading it in
         if self.paused and not self.flat_asked:  # the time of the pause must not count as a part of a blend
             target = self._flatness.value

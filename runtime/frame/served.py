@@ -25,9 +25,7 @@ def matched(solution: Solution, eyes: EyesEstimate) -> tuple[F64, F64]:
 
 
 def _of(eyes_m: Eyes, people: list[int]) -> F64:
-    return (
-        eyes_m if len(eyes_m) == 2 * len(people) == 2 else np.concatenate([eyes_m[2 * n : 2 * n + 2] for n in people])
-    )
+    return np.concatenate([eyes_m[2 * n : 2 * n + 2] for n in people])
 
 
 def moved_m2(before_m: Eyes, after_m: Eyes) -> float:

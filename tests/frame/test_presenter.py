@@ -198,6 +198,12 @@ def test_before_the_first_solution_the_flat_picture_is_shown_without_fading() ->
     stage.solver.hand_over(solved=solution(2))
     (done,) = stage.refresh()
     assert (done.frame.flatness, done.account.inference, done.account.effort) == (0.0, "ran", "1/1+0")
+    asked = Stage()
+    asked.presenter.flat_asked = True
+    asked.solver.hand_over(flat=solution(1, None), solved=solution(2))
+    assert asked.refresh(5)[-1].frame.flatness == 1.0
+    asked.presenter.flat_asked = False
+    assert asked.refresh()[0].frame.flatness == 0.0, "the first picture that is seen"
 
 
 def test_a_lost_viewer_is_held_then_fades_to_flat_and_back(stage: Stage) -> None:

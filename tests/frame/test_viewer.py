@@ -144,12 +144,12 @@ def test_looking_ahead_for_the_solver_changes_nothing_of_what_is_shown() -> None
 
 def test_the_tracker_is_reset_only_by_its_own_settings() -> None:
     seen = viewer()
-    watched(seen, 1.0, noise_m=0.001)
+    assert watched(seen, 3.0, noise_m=0.001)[-1].label == "rested"
     calibration = load_calibration(None)
     seen.adopt(Settings.model_validate({"plan": {"enabled": False}}), calibration)
-    assert seen.at(2 * NS_PER_S).eyes_m is not None
+    assert seen.at(4 * NS_PER_S).eyes_m is not None and seen.at(4 * NS_PER_S).label == "predicted"
     seen.adopt(Settings.model_validate({"plan": {"enabled": False}, "tracker": {"hold_s": 2.0}}), calibration)
-    assert seen.at(2 * NS_PER_S).eyes_m is None
+    assert seen.at(4 * NS_PER_S).eyes_m is None
 
 
 def test_samples_of_a_sensor_in_its_own_frame_go_through_the_calibration() -> None:
