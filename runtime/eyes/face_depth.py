@@ -77,7 +77,7 @@ class FaceDepth:
             scale = self._distance / length  # metres per mesh pixel
             tilts_m = tilts[0] * scale, tilts[1] * scale
             self._measure(pupils, depth_mm, depth_from_colour, relief * scale, eyes * scale, tilts_m, away)
-        elif not self._known:
+        elif not (self._known or self.has_measured):
             self._learn(length / pupils.iris_px)
         middle = self._distance * away
         shape = self._shape - self._shape.mean()

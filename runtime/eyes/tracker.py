@@ -227,8 +227,8 @@ class Tracker:
         """Return the (3, 3) covariance of the eyes' midpoint, in m²: the driver's, raised, or the settings'."""
         if points.covariance_m2 is not None and np.isfinite(points.covariance_m2).all():
             noise: F64 = (points.covariance_m2 + points.covariance_m2.T) / 2
-            if not _exceeds(noise, NOISE_FLOOR_M**2):
-                variances, axes = np.linalg.eigh(noise)
+            variances, axes = np.linalg.eigh(noise)
+            if variances[0] < NOISE_FLOOR_M**2:
                 noise = (axes * np.maximum(variances, NOISE_FLOOR_M**2)) @ axes.T
         elif self._measured.sigma_m is not None:
             noise = np.diag(self._measured.sigma_m**2 / 2)
@@ -349,14 +349,6 @@ class Tracker:
         error_m2 = imm.spread(head.moments, age_s) + off_m.T @ off_m  # an eye is the midpoint plus or minus the vector
         sigma_m = sideways_sigma_m(error_m2, head_m[0], panel_m=self._panel_m)
         return EyesEstimate(time_ns, head.capture_ns, eyes_m, label, sigma_m)
-
-
-def _exceeds(covariance: F64, variance: float) -> bool:
-    """Return True if a (3, 3) covariance has more than a variance in every direction, by Sylvester's criterion."""
-    (xx, xy, xz), (_, yy, yz), (_, _, zz) = covariance.tolist()
-    xx, yy, zz = xx - variance, yy - variance, zz - variance
-    minor = xx * yy - xy * xy
-    return bool(xx > 0 and minor > 0 and zz * minor + 2 * xy * xz * yz - xx * yz * yz - yy * xz * xz > 0)
 
 
 def sideways_sigma_m(error_m2: F64, eye_m: F64, *, panel_m: tuple[float, float]) -> float:

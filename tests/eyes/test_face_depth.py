@@ -7,9 +7,10 @@ import pytest
 
 from runtime.config import Settings
 from runtime.eyes.detect import EyeFinder, covariance
-from runtime.eyes.face_depth import FaceDepth
+from runtime.eyes.face_depth import EyeDepths, FaceDepth
+from runtime.eyes.face_flow import RIGID
 from runtime.eyes.pupils import CORNERS, Pupils
-from runtime.records import SensorFrame
+from runtime.records import U16, Intrinsics, SensorFrame
 from tests.eyes.scene import IPD_M, camera, frame, scene
 
 CAMERA = camera(640, 480, 65.0)
@@ -145,3 +146,111 @@ def test_what_is_no_viewer_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     colour, depth, _ = scene(np.array([0.0, 0.0, 2.5]), intrinsics=camera(), wall_m=6.0)
     monkeypatch.setattr("runtime.eyes.detect.RANGE_MAX_M", 2.0)
     assert finder.find(frame(colour, depth, camera())) is None and "the maximum is 2 m" in finder.reason
+
+
+PLAIN_CAMERA = Intrinsics(640, 480, 400.0, 625.0, 320.0, 240.0)  # focal lengths of 500 pixels on average
+LEFT_EYE, RIGHT_EYE = np.s_[225:255, 340:360], np.s_[225:255, 280:310]
+
+
+def plain(*, apart_px: float = 60.0, deep_px: float = 0.0, relief_px: float = 0.0, iris_px: float = 12.0) -> Pupils:
+    """A face in the picture's middle whose mesh points lie anywhere; the left eye is the deeper one."""
+    random = np.random.default_rng(1)
+    eyes = np.array([[320 + apart_px / 2, 240], [320 - apart_px / 2, 240]])
+    mesh = np.column_stack([random.uniform([270, 200], [370, 300], (468, 2)), relief_px * random.uniform(-1, 1, 468)])
+    for (x, y), corners, side in zip(eyes, CORNERS, (0.5, -0.5), strict=True):
+        mesh[list(corners)] = [[x + 9, y, side * deep_px], [x - 9, y, side * deep_px]]
+    return Pupils(eyes, 0.3, mesh, iris_px, "found", "", 1.0)
+
+
+def wall(depth_mm: int = 500) -> U16:
+    return np.full((480, 640), depth_mm, np.uint16)
+
+
+def measured(
+    depth_mm: U16 | None, *, pupils: Pupils | None = None, face: FaceDepth | None = None, scale: float = 1.0
+) -> EyeDepths:
+    return (face or FaceDepth()).at(pupils or plain(), depth_mm, PLAIN_CAMERA, np.full(2, scale))
+
+
+def test_without_depth_the_distance_follows_from_irises_or_settings() -> None:
+    learnt, known = FaceDepth(), FaceDepth(eye_distance_m=0.06)
+    for iris_px in (12.0, 12.0, 6.0):  # the third is a mistake
+        told = measured(None, pupils=plain(iris_px=iris_px), face=learnt)
+        np.testing.assert_allclose([*told.eyes_m, told.sigma_m], [0.5087, 0.5087, 0.0228], atol=1e-4)
+    for pupils, eyes_m in ((plain(), (0.5, 0.5)), (plain(apart_px=48, deep_px=36), (0.518, 0.482))):
+        told = measured(None, pupils=pupils, face=known)
+        np.testing.assert_allclose([*told.eyes_m, told.sigma_m], [*eyes_m, 0.00905], atol=1e-5)
+    assert not learnt.has_measured and not known.has_measured
+
+
+@pytest.mark.parametrize(("depth_mm", "is_a_person"), [(373, False), (377, True), (705, True), (711, False)])
+def test_depth_must_fit_eyes_45_to_85_mm_apart(depth_mm: int, is_a_person: bool) -> None:
+    face = FaceDepth()
+    measured(wall(depth_mm), face=face)
+    assert face.has_measured is is_a_person
+
+
+@pytest.mark.parametrize(("count", "is_enough"), [(7, False), (8, True)])
+def test_eight_points_with_depth_are_enough(count: int, is_enough: bool) -> None:
+    depth, face = wall(0), FaceDepth()
+    columns, rows = plain().mesh_px[RIGID][10 : 10 + count, :2].astype(int).T
+    depth[rows, columns] = 500
+    told = measured(depth, face=face)
+    assert face.has_measured is is_enough
+    assert told.eyes_m.mean() == pytest.approx(0.5 if is_enough else 0.525, abs=1e-4)  # else an adult's mean
+
+
+@pytest.mark.parametrize(
+    ("left_mm", "right_mm", "eyes_m", "sigma_mm"),
+    [
+        (5, 5, (0.5045, 0.5045), 1.96),
+        (15, 15, (0.5135, 0.5135), 1.96),
+        (0, 15, (0.5, 0.5135), 1.96),
+        (25, 25, (0.5, 0.5), 6.02),  # glasses
+        (-25, 5, (0.5, 0.5045), 4.48),
+    ],
+)
+def test_nine_tenths_of_an_eye_s_own_depth_count_at_once(
+    left_mm: int, right_mm: int, eyes_m: tuple[float, float], sigma_mm: float
+) -> None:
+    depth = wall()
+    depth[LEFT_EYE], depth[RIGHT_EYE] = 500 + left_mm, 500 + right_mm
+    for told in (measured(depth), measured(depth[::2, ::2], scale=0.5)):
+        np.testing.assert_allclose([*told.eyes_m, told.sigma_m], [*eyes_m, sigma_mm / 1000], atol=2e-5)
+
+
+@pytest.mark.parametrize("edge", [0, -1])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_points_outside_the_depth_picture_have_no_depth(axis: int, edge: int) -> None:
+    size, move_px = [480, 640], np.zeros(2)
+    move_px[1 - axis] = -[230, 310][axis] if edge == 0 else 0
+    size[axis] = 250 if axis == 0 else 330
+    depth = np.full(size, 500, np.uint16)
+    depth[np.s_[edge, :] if axis == 0 else np.s_[:, edge]] = 520
+    face = plain()
+    moved = Pupils(face.eyes_px + move_px, 0.3, face.mesh_px + np.array([*move_px, 0.0]), 12.0, "found", "", 1.0)
+    camera = Intrinsics(640, 480, 500.0, 500.0, 320.0 + move_px[0], 240.0 + move_px[1])
+    told = FaceDepth().at(moved, depth, camera, np.ones(2))
+    np.testing.assert_allclose(told.eyes_m, 0.5, atol=1e-4)
+
+
+@pytest.mark.parametrize(("ratio", "apart_mm"), [(0.0, 0.0), (0.5, 5.0), (1.0, 10.0), (1.3, 13.0), (1.6, 13.0)])
+def test_eyes_are_as_deep_as_the_face_has_relief(ratio: float, apart_mm: float) -> None:
+    """A printed face has none."""
+    pupils, depth = plain(relief_px=20.0, deep_px=10.0), wall()
+    for x, y, z in pupils.mesh_px[RIGID]:
+        depth[int(y) - 1 : int(y) + 2, int(x) - 1 : int(x) + 2] = round(500 + ratio * z)
+    depth[LEFT_EYE] = depth[RIGHT_EYE] = 0
+    told = measured(depth, pupils=pupils, face=FaceDepth(eye_distance_m=0.0608))
+    assert (told.eyes_m[0] - told.eyes_m[1]) * 1000 == pytest.approx(apart_mm, abs=0.4)
+
+
+def test_a_measured_face_is_known_until_the_head_turns() -> None:
+    face = FaceDepth()
+    sigmas_m = [measured(wall(), face=face).sigma_m for _ in range(6)]
+    assert sigmas_m == sorted(sigmas_m, reverse=True) and sigmas_m[-1] < 0.0009
+    kept, turned, back = (
+        measured(None, pupils=pupils, face=face) for pupils in (plain(), plain(apart_px=48, deep_px=36), plain())
+    )
+    np.testing.assert_allclose(np.stack([kept.eyes_m, turned.eyes_m]), 0.5, atol=1e-5)
+    np.testing.assert_allclose([kept.sigma_m, turned.sigma_m, back.sigma_m], [0.00095, 0.0300, 0.0424], atol=1e-4)
