@@ -139,8 +139,6 @@ class FaceDepth:
                 self._shape_variance[side] *= 1 - gain
         noise = (1.25 * spread / np.sqrt(len(depths))) ** 2 + POINT_SIGMA_M**2
         seen = (middle + float(self._shape.mean())) / away
-        if not self.has_measured and not self._known:
-            self._variance = EYE_DISTANCE_M[1] ** 2
         gain = self._variance / (self._variance + noise / away**2)
         self._distance += gain * (seen - self._distance)
         self._variance *= 1 - gain
@@ -149,7 +147,7 @@ class FaceDepth:
     def _fit_relief(self, depths: F64, shape: F64) -> None:
         """Update the ratio of the face's relief to the mesh's, which is near 0 for a printed face."""
         off = shape - shape.mean()
-        seen = float(np.clip(off @ (depths - depths.mean()) / max(float(off @ off), 1e-12), 0, RELIEF_MAX))
+        seen = float(np.clip(off @ depths / max(float(off @ off), 1e-12), 0, RELIEF_MAX))
         self._reliefs = min(self._reliefs + 1, RELIEF_PICTURES)
         self._relief += (seen - self._relief) / self._reliefs
 

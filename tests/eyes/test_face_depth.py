@@ -200,16 +200,10 @@ def test_eight_points_with_depth_are_enough(count: int, is_enough: bool) -> None
     assert told.eyes_m.mean() == pytest.approx(0.5 if is_enough else 0.525, abs=1e-4)  # else an adult's mean
 
 
-@pytest.mark.parametrize(
-    ("left_mm", "right_mm", "eyes_m", "sigma_mm"),
-    [
-        (5, 5, (0.5045, 0.5045), 1.96),
-        (15, 15, (0.5135, 0.5135), 1.96),
-        (0, 15, (0.5, 0.5135), 1.96),
-        (25, 25, (0.5, 0.5), 6.02),  # glasses
-        (-25, 5, (0.5, 0.5045), 4.48),
-    ],
-)
+@pytest.mark.parametrize(("left_mm", "right_mm", "eyes_m", "sigma_mm"), [
+    (5, 5, (0.5045, 0.5045), 1.96), (15, 15, (0.5135, 0.5135), 1.96), (0, 15, (0.5, 0.5135), 1.96),
+    (25, 25, (0.5, 0.5), 6.02), (-25, 5, (0.5, 0.5045), 4.48),
+])  # fmt: skip
 def test_nine_tenths_of_an_eye_s_own_depth_count_at_once(
     left_mm: int, right_mm: int, eyes_m: tuple[float, float], sigma_mm: float
 ) -> None:

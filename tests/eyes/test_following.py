@@ -132,22 +132,14 @@ def test_pupils_are_raised_by_0_6_mm_on_the_face(film: Film, face: Face) -> None
     assert found.sigma_px == pytest.approx(np.hypot(0.0088 * face.apart, 0.14), rel=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("pictures", "gaze", "moved_px", "sigma_px"),
-    [
-        (1, 0.01, 0.3, 0.62),  # half of the deviation at first, and a tenth in the end
-        (3, 0.01, 0.15, 0.62),
-        (15, 0.01, 0.06, 0.62),
-        (15, -0.01, -0.06, 0.62),
-        (15, 0.02, 0.12, 0.81),
-        (15, 0.04, 0.96, 1.32),
-        (15, 0.06, 2.52, 1.88),
-        (15, 0.10, 4.2, 1.88),
-    ],
-)
+@pytest.mark.parametrize(("pictures", "gaze", "moved_px", "sigma_px"), [
+    (1, 0.01, 0.3, 0.62), (3, 0.01, 0.15, 0.62), (15, 0.01, 0.06, 0.62), (15, -0.01, -0.06, 0.62),
+    (15, 0.02, 0.12, 0.81), (15, 0.04, 0.96, 1.32), (15, 0.06, 2.52, 1.88), (15, 0.10, 4.2, 1.88),
+])  # fmt: skip
 def test_pupils_are_averaged_unless_the_gaze_turns(
     film: Film, pictures: int, gaze: float, moved_px: float, sigma_px: float
 ) -> None:
+    """Half of a deviation counts at first, and a tenth in the end."""
     still = film.see(Face(), count=pictures)
     turned = film.see(Face(gaze=(gaze, gaze)))
     assert still is not None and turned is not None and turned.seen == "followed"
@@ -187,41 +179,23 @@ ANOTHER = "another person's face"
 ANIMAL = "a face without a person's eyes"
 
 
-@pytest.mark.parametrize(
-    ("face", "reason"),
-    [
-        (Face(irises=(0.121, 0.121)), ""),
-        (Face(irises=(0.119, 0.13)), ANIMAL),
-        (Face(irises=(0.329, 0.329)), ""),
-        (Face(irises=(0.331, 0.32)), ANIMAL),
-        (Face(irises=(0.2, 0.279)), ""),
-        (Face(irises=(0.2, 0.281)), ANIMAL),
-        (Face(irises=(0.281, 0.2)), ANIMAL),
-        (Face(presence=0.9), ""),
-        (Face(presence=0.899), "no face"),
-        (Face(score=0.801), ""),
-        (Face(score=0.8), "no face"),
-        (Face(longest_px=640), ""),
-        (Face(longest_px=641), "no face"),
-    ],
-)
+@pytest.mark.parametrize(("face", "reason"), [
+    (Face(irises=(0.121, 0.121)), ""), (Face(irises=(0.119, 0.13)), ANIMAL), (Face(irises=(0.329, 0.329)), ""),
+    (Face(irises=(0.331, 0.32)), ANIMAL), (Face(irises=(0.2, 0.279)), ""), (Face(irises=(0.2, 0.281)), ANIMAL),
+    (Face(irises=(0.281, 0.2)), ANIMAL), (Face(presence=0.9), ""), (Face(presence=0.899), "no face"),
+    (Face(score=0.801), ""), (Face(score=0.8), "no face"), (Face(longest_px=640), ""),
+    (Face(longest_px=641), "no face"),
+])  # fmt: skip
 def test_only_a_person_is_a_viewer(film: Film, face: Face, reason: str) -> None:
     assert (film.see(face) is None) == bool(reason) and film.finder.reason == reason
     assert film.finder.viewer == (not reason) and film.finder.is_free == bool(reason)
     assert film.finder.choice == ("no viewer yet" if reason else "following the foremost of 1 face(s)")
 
 
-@pytest.mark.parametrize(
-    ("face", "is_followed", "is_found_again"),
-    [
-        (Face(presence=0.5), True, False),
-        (Face(presence=0.49), False, False),
-        (Face(alike=0.8), True, True),
-        (Face(alike=0.68), True, False),
-        (Face(alike=0.5), False, False),
-        (Face(x=360), True, True),
-    ],
-)
+@pytest.mark.parametrize(("face", "is_followed", "is_found_again"), [
+    (Face(presence=0.5), True, False), (Face(presence=0.49), False, False), (Face(alike=0.8), True, True),
+    (Face(alike=0.68), True, False), (Face(alike=0.5), False, False), (Face(x=360), True, True),
+])  # fmt: skip
 def test_a_viewer_is_followed_more_readily_than_found_again(
     film: Film, face: Face, is_followed: bool, is_found_again: bool
 ) -> None:

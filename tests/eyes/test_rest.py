@@ -90,16 +90,10 @@ def rested(eyes: np.ndarray = EYES, *, count: int = 60, noise_m: float = 0.0) ->
 NEWEST_NS = 59 * NS_PER_S // 30
 
 
-@pytest.mark.parametrize(
-    ("capture_ns", "rests"),
-    [
-        (NEWEST_NS + 1, True),
-        (NEWEST_NS + NS_PER_S - 1, True),
-        (NEWEST_NS + NS_PER_S, False),
-        (NEWEST_NS, False),
-        (NEWEST_NS - NS_PER_S, False),
-    ],
-)
+@pytest.mark.parametrize(("capture_ns", "rests"), [
+    (NEWEST_NS + 1, True), (NEWEST_NS + NS_PER_S - 1, True), (NEWEST_NS + NS_PER_S, False), (NEWEST_NS, False),
+    (NEWEST_NS - NS_PER_S, False),
+])  # fmt: skip
 def test_a_gap_or_a_clock_that_was_set_back_ends_rest(capture_ns: int, rests: bool) -> None:
     watch = rested()
     watch.update(EYES, capture_ns=capture_ns)
@@ -113,24 +107,16 @@ ASIDE = np.array([[0.6, 0.269, 0.2], [0.6, 0.331, 0.2]])
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-@pytest.mark.parametrize(
-    ("eyes", "step_mm", "leaves"),
-    [
-        (EYES, (0.0, 0.29, 0.0), False),
-        (EYES, (0.0, 0.31, 0.0), True),
-        (EYES, (0.0, 0.0, 0.29), False),
-        (EYES, (0.0, 0.0, 0.31), True),
-        (EYES * [1, 1, 0], (1.15, 0.0, 0.0), False),  # a quarter of it is seen at the display's edges
-        (EYES * [1, 1, 0], (1.25, 0.0, 0.0), True),
-        (EYES * [0.1, 1, 0], (0.25, 0.0, 0.0), True),
-        (ASIDE, (1.0, 0.5, 0.333), False),  # towards the display's centre
-        (ASIDE, (1.0, 0.0, 0.333), True),
-        (ASIDE, (1.0, 0.5, 0.0), True),
-    ],
-)
+@pytest.mark.parametrize(("eyes", "step_mm", "leaves"), [
+    (EYES, (0.0, 0.29, 0.0), False), (EYES, (0.0, 0.31, 0.0), True), (EYES, (0.0, 0.0, 0.29), False),
+    (EYES, (0.0, 0.0, 0.31), True), (EYES * [1, 1, 0], (1.15, 0.0, 0.0), False),
+    (EYES * [1, 1, 0], (1.25, 0.0, 0.0), True), (EYES * [0.1, 1, 0], (0.25, 0.0, 0.0), True),
+    (ASIDE, (1.0, 0.5, 0.333), False), (ASIDE, (1.0, 0.0, 0.333), True), (ASIDE, (1.0, 0.5, 0.0), True),
+])  # fmt: skip
 def test_a_head_has_left_at_its_second_sample_seen_elsewhere(
     eyes: np.ndarray, step_mm: tuple[float, float, float], leaves: bool, sign: float
 ) -> None:
+    """Depth counts by a quarter, which is seen at the display's edges, and nothing is seen of a way to its centre."""
     watch, place = rested(eyes), eyes + sign * np.array(step_mm) / 1000
     rests = []
     for number in range(60, 95):

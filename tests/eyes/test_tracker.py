@@ -197,19 +197,12 @@ def test_another_person_is_followed_after_half_a_second_or_the_hold(hold_s: floa
         assert tracker.seen_ns == (last if why else last + ms * MS)
 
 
-@pytest.mark.parametrize(("seen_first", "why"), [(False, ""), (True, ELSEWHERE)])
-def test_a_sample_that_another_person_fits_better_is_theirs(seen_first: bool, why: str) -> None:
+@pytest.mark.parametrize(("y_m", "seen_first", "why"), [(0.24, False, ""), (0.24, True, ELSEWHERE), (0.2, True, "")])
+def test_a_doubtful_sample_that_another_person_fits_better_is_theirs(y_m: float, seen_first: bool, why: str) -> None:
     tracker, last = fed(covariance_m2=FINE_M2)
     if seen_first:  # too soon for the viewer to have gone there
         assert tracker.update(aside(0.29, covariance_m2=FINE_M2), capture_ns=last + 10 * MS) == ELSEWHERE
-    assert tracker.update(aside(0.24, covariance_m2=FINE_M2), capture_ns=last + 350 * MS) == why
-
-
-@pytest.mark.parametrize("near_m", [0.15, 0.2])
-def test_a_sample_that_certainly_is_the_viewer_s_is_theirs(near_m: float) -> None:
-    tracker, last = fed(covariance_m2=FINE_M2)
-    assert tracker.update(aside(0.29, covariance_m2=FINE_M2), capture_ns=last + 10 * MS) == ELSEWHERE
-    assert tracker.update(aside(near_m, covariance_m2=FINE_M2), capture_ns=last + 350 * MS) == ""
+    assert tracker.update(aside(y_m, covariance_m2=FINE_M2), capture_ns=last + 350 * MS) == why
 
 
 @pytest.mark.parametrize(("y_m", "third"), [(0.20, ""), (0.162, ""), (0.155, ELSEWHERE)])
@@ -232,30 +225,18 @@ def test_a_head_is_established_with_its_third_sample() -> None:
         assert tracker.seen_ns == ms * MS and tracker.is_established is is_established
 
 
-@pytest.mark.parametrize(
-    ("samples", "age_ms", "reach_m"),
-    [
-        *((30, age_ms, None) for age_ms in (-100, 0, 251)),
-        *((30, age_ms, reach_m) for age_ms, reach_m in ((10, 0.0166), (100, 0.0661), (200, 0.2161), (250, 0.3286))),
-        *((2, age_ms, reach_m) for age_ms, reach_m in ((0, None), (10, 0.0370), (100, 0.2170), (250, 0.5170))),
-    ],
-)
+@pytest.mark.parametrize(("samples", "age_ms", "reach_m"), [
+    *((30, age_ms, None) for age_ms in (-100, 0, 251)),
+    *((30, age_ms, reach_m) for age_ms, reach_m in ((10, 0.0166), (100, 0.0661), (200, 0.2161), (250, 0.3286))),
+    *((2, age_ms, reach_m) for age_ms, reach_m in ((0, None), (10, 0.0370), (100, 0.2170), (250, 0.5170))),
+])  # fmt: skip
 def test_people_are_recognised_within_their_reach(samples: int, age_ms: int, reach_m: float | None) -> None:
     """At 10 m/s² once established, else at 2 m/s, and with the noise; for a quarter of a second."""
     tracker, last = fed(samples, covariance_m2=FINE_M2)
     found = tracker.reach_m(aside(0.005, covariance_m2=FINE_M2), capture_ns=last + age_ms * MS)
-    assert found == (None if reach_m is None else (pytest.approx(0.005), pytest.approx(reach_m, abs=2e-4)))
+    assert (found is None) == (reach_m is None)
+    np.testing.assert_allclose([*(found or ())], [] if reach_m is None else [0.005, reach_m], atol=2e-4)
     assert Tracker().reach_m(points(), capture_ns=last) is None
-
-
-@pytest.mark.parametrize(("off_m", "is_same"), [(0.01, True), (0.025, False), (0.07, False)])
-def test_a_head_that_breaks_with_its_motion_is_not_recognised(off_m: float, is_same: bool) -> None:
-    tracker, last = fed(60, moving, covariance_m2=FINE_M2)
-    for forth in (-off_m, off_m):
-        eyes = moving(59 + 3) + np.array([0.0, forth, 0.0])
-        found = tracker.reach_m(points(eyes, covariance_m2=FINE_M2), capture_ns=last + 3 * PERIOD)
-        assert (found is not None) is is_same
-        assert found is None or found[0] == pytest.approx(off_m, abs=1e-4)
 
 
 @given(
@@ -316,24 +297,12 @@ def test_a_covariance_that_is_none_breaks_nothing(covariance_m2: NDArray[np.floa
     np.testing.assert_allclose(tracker.at(last + 50 * MS).eyes_m, STILL, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("told", "used"),
-    [
-        (np.diag([1e-6, 1e-6, 1e-14]), np.diag([1e-6, 1e-6, 4e-10])),
-        (np.diag([1e-14, 1e-6, 1e-6]), np.diag([4e-10, 1e-6, 1e-6])),
-        (np.diag([1e-6, 1e-14, 1e-6]), np.diag([1e-6, 4e-10, 1e-6])),
-        (np.diag([1e-6, 3.9e-10, 1e-6]), np.diag([1e-6, 4e-10, 1e-6])),
-        (np.diag([4e-6, 2e-6, 1e-6]) + np.eye(3)[[1, 0, 2]] * [3e-6, 3e-6, 0], None),
-        (np.diag([4e-6, 1e-6, 2e-6]) + np.eye(3)[[2, 1, 0]] * [3e-6, 0, 3e-6], None),
-        (np.diag([1e-6, 4e-6, 2e-6]) + np.eye(3)[[0, 2, 1]] * [0, 3e-6, 3e-6], None),
-        (np.full((3, 3), 1e-6) + np.diag([1e-6, 1e-6, 1e-6]), None),
-        (np.full((3, 3), -1e-6) + np.diag([2.5e-6, 2.5e-6, 2.5e-6]), None),
-        (
-            np.array([[1e-6, 8e-7, 0], [0, 1e-6, 0], [0, 0, 1e-6]]),
-            np.eye(3) * 1e-6 + np.eye(3)[[1, 0, 2]] * [4e-7, 4e-7, 0],
-        ),
-    ],
-)
+@pytest.mark.parametrize(("told", "used"), [
+    (np.diag([1e-6, 3.9e-10, 1e-6]), np.diag([1e-6, 4e-10, 1e-6])),
+    (np.diag([4e-6, 2e-6, 1e-6]) + np.eye(3)[[1, 0, 2]] * [3e-6, 3e-6, 0], None),
+    (np.full((3, 3), -1e-6) + np.diag([2.5e-6, 2.5e-6, 2.5e-6]), None),
+    (np.eye(3) * 1e-6 + np.diag([8e-7, 0], 1), np.eye(3) * 1e-6 + np.diag([4e-7, 0], 1) + np.diag([4e-7, 0], -1)),
+])  # fmt: skip
 def test_a_driver_s_noise_is_raised_to_20_micrometres_in_every_direction(
     told: NDArray[np.float64], used: NDArray[np.float64] | None
 ) -> None:
@@ -389,18 +358,12 @@ def test_an_error_along_the_line_of_sight_counts_as_depth(eye_m: tuple[float, fl
     assert told == pytest.approx(on_axis) == pytest.approx(1e-3 * np.sqrt((0.25 + 0.09) / 24) / eye_m[0])
 
 
-@pytest.mark.parametrize(
-    ("error_m2", "eye_m", "expected_m"),
-    [
-        (np.diag([0, 4e-6, 0]), (0.6, 0.3, 0.2), 0.001414),
-        (np.diag([0, 0, 4e-6]), (0.6, 0.3, 0.2), 0.001414),
-        (np.diag([0, 4e-6, 4e-6]), (3.0, 0, 0), 0.002),
-        (np.diag([1e-6, 0, 0]), (0.6, 0.3, 0.2), 0.000469),
-        (np.diag([1e-6, 0, 0]), (0.1, 0, 0), 0.00119),
-        (np.diag([1e-6, 0, 0]), (0.05, 0, 0), 0.00119),
-        (-np.eye(3), (0.6, 0, 0), 0.0),
-    ],
-)
+@pytest.mark.parametrize(("error_m2", "eye_m", "expected_m"), [
+    (np.diag([0, 4e-6, 0]), (0.6, 0.3, 0.2), 0.001414), (np.diag([0, 0, 4e-6]), (0.6, 0.3, 0.2), 0.001414),
+    (np.diag([0, 4e-6, 4e-6]), (3.0, 0, 0), 0.002), (np.diag([1e-6, 0, 0]), (0.6, 0.3, 0.2), 0.000469),
+    (np.diag([1e-6, 0, 0]), (0.1, 0, 0), 0.00119), (np.diag([1e-6, 0, 0]), (0.05, 0, 0), 0.00119),
+    (-np.eye(3), (0.6, 0, 0), 0.0),
+])  # fmt: skip
 def test_sideways_errors_count_fully_per_axis(
     error_m2: NDArray[np.float64], eye_m: tuple[float, float, float], expected_m: float
 ) -> None:

@@ -99,16 +99,10 @@ def test_a_perfect_sensor_sees_everybody_in_view_nearest_first() -> None:
     assert set(seen[:34]) == {1} and set(seen[34:64]) == {2} and set(seen[64:114]) == {1} and set(seen[114:]) == {0}
 
 
-def test_a_sensor_errs_by_three_millimetres_and_at_times_by_more() -> None:
-    samples = observe_two("two-still", seconds=60.0, rate_hz=30.0)
-    off_m = np.concatenate([
-        np.abs(np.subtract(one.eyes_m, pair)).max(axis=1)
-        for sample in samples if len(sample.people) == 2 and sample.true_eyes_m is not None
-        for one, pair in zip(sample.people, sample.true_eyes_m.reshape(2, 2, 3), strict=True)
-    ])  # fmt: skip
-    assert 0.0038 < np.median(off_m) < 0.0048 and 0.02 < np.mean(off_m > 0.015) < 0.06
+def test_a_sensor_errs_unless_told_otherwise() -> None:
+    samples = observe_two("two-still", seconds=20.0, rate_hz=30.0)
     assert np.mean([len(sample.people) == 0 for sample in samples]) == pytest.approx(0.05, abs=0.004)
-    again, other = (observe_two("two-still", seconds=1.0, rate_hz=30.0, seed=seed) for seed in (1, 2))
-    assert again[0].eyes is not None and other[0].eyes is not None and samples[0].eyes is not None
-    assert np.array_equal(again[0].eyes.eyes_m, samples[0].eyes.eyes_m)
-    assert not np.array_equal(again[0].eyes.eyes_m, other[0].eyes.eyes_m)
+    seen = [sample for sample in samples if len(sample.people) == 2 and sample.true_eyes_m is not None]
+    off_m = np.abs([np.ravel([one.eyes_m for one in sample.people]) - np.ravel(sample.true_eyes_m) for sample in seen])
+    assert 0.0018 < np.median(off_m) < 0.0023 and 0.01 < np.mean(off_m > 0.015) < 0.06
+    assert len({str(observe_two("two-still", seconds=1.0, rate_hz=30.0, seed=seed)[0].eyes) for seed in (1, 1, 2)}) == 2
