@@ -38,9 +38,19 @@ def test_shipped_models_keep_their_contract_and_are_small(name: str) -> None:
         ({"panels": "three"}, "panels"),
         ({"value_range": [0, "x"]}, "value_range"),
         ({"steps": [{"kind": "front"}]}, "kind"),
-        ({"steps": [{"size": -1}]}, "size"),
-        ({"cell_px": -1}, "cell_px"),
-        ({"cell_px": 1e9}, "cell_px"),
+        ({"steps": [{"size": 0}]}, "size"),
+        ({"steps": [{"size": 3.1}]}, "size"),
+        ({"cell_px": 0}, "cell_px"),
+        ({"cell_px": 65}, "cell_px"),
+        ({"panels": 1}, "panels"),
+        ({"panels": 7}, "panels"),
+        ({"width_px": 16385}, "width_px"),
+        ({"picture_fov_deg": 180}, "picture_fov_deg"),
+        ({"inputs": [{"name": "x", "axes": []}] * 33}, "inputs"),
+        ({"inputs": [{"name": "x", "axes": ["a"] * 9}]}, "axes"),
+        ({"steps": [{}] * 65}, "steps"),
+        ({"steps": [{"momentum": 1}]}, "momentum"),
+        ({"steps": [{"floor": 0}]}, "floor"),
         ({"outputs": []}, "outputs"),
     ],
 )
@@ -49,39 +59,14 @@ def test_a_contract_that_does_not_fit_is_refused_by_field(change: dict[str, obje
         parse_contract({METADATA_KEY: json.dumps(contract_of("fast") | change)}, source="m.onnx")
 
 
-@pytest.mark.parametrize(
-    ("field", "good", "bad"),
-    [
-        ("panels", [2, 6], [1, 7]),
-        ("width_px", [0, 16384], [-1, 16385]),
-        ("height_px", [0, 16384], [-1, 16385]),
-        ("cell_px", [1, 64], [0, 65]),
-        ("picture_fov_deg", [0, 179.9], [-1, 180]),
-        ("parameters", [0], [-1]),
-        (
-            "inputs",
-            [[{"name": "x", "axes": ["a"] * 8}] * 32],
-            [[], [{"name": "x", "axes": []}] * 33, [{"name": "x", "axes": ["a"] * 9}]],
-        ),
-        ("outputs", [[{"name": "x", "axes": []}] * 32], [[{"name": "x", "axes": []}] * 33, [{"name": "", "axes": []}]]),
-        (
-            "steps",
-            [[], [{"size": 3}] * 64, [{"floor": 1}], [{"momentum": 0}]],
-            [[{}] * 65, [{"size": 3.1}], [{"size": 0}]],
-        ),
-        (
-            "steps",
-            [[{"momentum": 0.99, "floor": 0.01}]],
-            [[{"momentum": 1}], [{"momentum": -0.1}], [{"floor": 0}], [{"floor": 1.1}]],
-        ),
-    ],
-)
-def test_a_contract_s_limits_are_in_range(field: str, good: list[object], bad: list[object]) -> None:
-    for value in good:
-        parse_contract({METADATA_KEY: json.dumps(contract_of("fast") | {field: value})}, source="m.onnx")
-    for value in bad:
-        with pytest.raises(InputError, match=field):
-            parse_contract({METADATA_KEY: json.dumps(contract_of("fast") | {field: value})}, source="m.onnx")
+def test_a_contract_s_limits_are_in_range() -> None:
+    port = {"name": "x", "axes": ["a"] * 8}
+    limits = {
+        "panels": 6, "width_px": 16384, "height_px": 16384, "cell_px": 64, "picture_fov_deg": 179.9,
+        "inputs": [port] * 32, "outputs": [port] * 32, "steps": [{"size": 3, "momentum": 0, "floor": 1}] * 64,
+    }  # fmt: skip
+    parse_contract({METADATA_KEY: json.dumps(contract_of("fast") | limits)}, source="m.onnx")
+    parse_contract({METADATA_KEY: json.dumps(contract_of("fast") | {"panels": 2, "cell_px": 1})}, source="m.onnx")
 
 
 @pytest.mark.parametrize("text", [None, "{", "[1]", "[" * 100_000, '{"a":' * 100_000])
