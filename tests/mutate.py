@@ -31,7 +31,7 @@ from coverage import CoverageData
 ROOT = Path(__file__).parents[1]
 COPIED = ("runtime", "calib", "model_export", "phasestack", "tests", "examples", "docs", "systemd", "pyproject.toml")
 TESTS_OF = {
-    "kernels": ("model", "panels", "optics"),
+    "kernels": ("model", "panels", "optics", "content/test_fringe.py"),
     "plan": ("plan", "frame"),
     "optics": ("optics", "panels/test_presentation_table.py"),
     "browser": ("daemon", "browser"),

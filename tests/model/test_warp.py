@@ -87,19 +87,22 @@ def test_images_may_be_turned_and_flipped(turns: int, flipped: bool, bent: str) 
     image = (2040 + 900 * np.sin(columns / 7) + 900 * np.cos(rows / 9)).astype(np.int16)
     (c, s), law = ((1, 0), (0, 1), (-1, 0), (0, -1))[turns], ColumnLaw(4e-3, 40.0)
     turn = 0.7 * np.array([[c, -s], [s, c]]) @ np.diag([-1.0 if flipped else 1.0, 1.0]) + [[0.02, -0.03], [0.01, 0.04]]
-    matrix = np.array([[*turn[0], 45 - turn[0] @ (40, 30)], [*turn[1], 40 - turn[1] @ (40, 30)], [0.0, 0.0, 1.0]])
+    matrix = np.array([[*turn[0], 45 - turn[0] @ (40, 30)], [*turn[1], 40 - turn[1] @ (40, 30)], [6e-4, -9e-4, 1.003]])
     laws = {} if bent == "neither" else {f"{bent}_columns": law}
     for channels in (1, 3):
         given = image if channels == 1 else image[..., None].repeat(3, 2)
         found = warp(given, matrix, size=(60, 80), outside=OUTSIDE, **laws)
         v, u = np.mgrid[:60, :80] + 0.5
         t = law.homography_from_column(u) if bent == "result" else u
-        x, y = (matrix[k, 0] * t + matrix[k, 1] * v + matrix[k, 2] for k in (0, 1))
+        x, y, w = (matrix[k, 0] * t + matrix[k, 1] * v + matrix[k, 2] for k in range(3))
+        x, y = x / w, y / w
         x = law.middle - np.log(1 - law.bend * (x - law.middle)) / law.bend if bent == "image" else x
         wanted = 2040 + 900 * np.sin((x - 0.5) / 7) + 900 * np.cos((y - 0.5) / 9)
         inner = (x > 1) & (x < 89) & (y > 1) & (y < 79)
         assert found.shape == (60, 80, *given.shape[2:]) and inner.mean() > 0.9
-        assert np.abs(found.reshape(60, 80, channels) - wanted[..., None])[inner].max() < 12
+        assert (
+            np.abs(found.reshape(60, 80, channels) - wanted[..., None])[inner].max() < 20
+        )  # an eighth of a pixel on the steepest slope
 
 
 @pytest.mark.parametrize("bent", ["neither", "image", "result"])
