@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -13,7 +14,7 @@ from runtime.model.buffers import LayerBuffer
 from runtime.model.contract import Step
 from runtime.model.cpu import CpuBackend
 from runtime.model.gl.state import GlBackend
-from runtime.model.job import Job, SolveWindow, drawn_job
+from runtime.model.job import Job, SolveWindow, Targets, drawn_job, drawn_views
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
 from runtime.support.gl import offscreen_context
@@ -117,3 +118,40 @@ def test_layers_show_panels_inside_and_rest_outside_a_window(backend: Any) -> No
         solving.write(buffer, 77)
     assert (buffer.pixels[1, ..., :3] == 77).all()
     state.close()
+
+
+def smooth(seed: int, size: tuple[int, int]) -> Any:
+    noise = cv2.GaussianBlur(np.random.default_rng(seed).random((*size, 3)), (0, 0), 3.0)
+    return np.rint(255 * np.clip(0.5 + 4 * (noise - 0.5), 0.1, 0.9))
+
+
+@pytest.mark.parametrize(
+    ("views", "channels", "panels", "filters"),
+    [(2, 3, 3, True), (8, 3, 3, True), (2, 3, 3, False), (2, 1, 3, True), (2, 3, 2, True), (3, 3, 4, True)],
+)
+def test_steps_move_every_device_s_panels_alike(
+    backend: Any, views: int, channels: int, panels: int, filters: bool
+) -> None:
+    """To the rounding of 16-bit numbers; a step moves the panels a hundred times as far."""
+    x_m = tuple(np.linspace(-0.01, 0.01, panels).tolist())
+    stack = replace(STACK, x_m=x_m, colour=(True,) * (panels - 1) + (filters,))
+    at = np.concatenate([eyes(0.6, side_m) for side_m in (0.0, 0.02, -0.02, 0.04)])[:views]
+    pictures = [smooth(9 + view, (48, 64)).astype(np.uint8) for view in range(views)]
+    asked = Job(Targets(stack, at, drawn_views(pictures, stack)), eye_sigma_m=0.01, channels=channels)
+    geometry, found = asked.targets.within(replace(WINDOW, taper_px=(30.0, 20.0))), []
+    for device in (CpuBackend(), backend):
+        with device.state(stack, threads=1).begin(asked, geometry) as solving:
+            steps = []
+            for n in range(panels):
+                values = 16 * smooth(n, (32, 48)).astype(np.int16)
+                solving.set_panel(n, values if channels == 3 else np.ascontiguousarray(values[..., 0]))
+            solving.start()
+            for size, places in ((0.7, "rising"), (0.5, "middle"), (0.5, "falling"), (0.0, "middle")):
+                if size:
+                    solving.step(Step(size=size, places=places))  # type: ignore[arg-type]
+                else:
+                    solving.close_middle()
+                steps.append([solving.panel(n).astype(int) for n in range(panels)])
+        found.append(np.array(steps))
+    assert np.abs(found[0][1] - found[0][0]).mean() > 30
+    assert np.abs(found[1] - found[0]).mean(axis=(2, 3, 4)).max() < 3

@@ -143,7 +143,8 @@ class GlSolution:
         sets, middle = self._geometry.closing_sets(), self._geometry.middle
         table = self._state.texture("table", (256, 1), 2, dtype="f4", data=target_table(self._count))
         inputs = {f"last{n}": self._panel("last", n) for n in range(self._count)} | {"table": Image(table, 256, 1)}
-        weights = {"rest": 0.5, "missing": self._geometry.missing_weight, "middle": middle}
+        rest = rest_of(self._count) / FULL
+        weights = {"rest": rest, "missing": self._geometry.missing_weight, "middle": middle}
         fields: list[tuple[Image, Image]] = []
         for number, (view, matrices) in enumerate(zip(sets.views, sets.panels_from_rays, strict=True)):
             weight, residual = self._rays(f"curvature {number}"), self._rays(f"gradient {number}")
@@ -153,9 +154,7 @@ class GlSolution:
             self._passes.draw("residual", (weight, residual), {**inputs, **targets}, uniforms, counts=panels)
             fields.append((weight, residual))
         gathered, uniforms, counts = self._gathered(fields, sets, middle)
-        last = {"last": self._panel("last", middle)}
-        self._passes.draw("fill", (self._panel("spare", middle),), {**last, **gathered}, uniforms, counts=counts)
-        self._state.swap("last", "spare", middle)
+        self._passes.draw("fill", (self._panel("last", middle),), gathered, {**uniforms, "rest": rest}, counts=counts)
 
     def start(self) -> None:
         self._state.ahead = "last"  # there is no momentum yet, so the first step reads the panels themselves
