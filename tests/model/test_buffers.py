@@ -71,7 +71,7 @@ def test_slots_are_pages_that_shared_memory_has_room_for() -> None:
 
 def test_the_solver_s_slots_are_free_again_once_the_presenter_lets_go(both: tuple[LayerSlots, LayerSlots]) -> None:
     ours, theirs = both
-    held = []
+    held: list[Any] = []
     for value in range(16):
         assert ours.has_room()
         buffer = ours.take(SHAPE)
