@@ -24,7 +24,9 @@ IOErrorHandler = ctypes.CFUNCTYPE(c_int, c_void_p)
 SERVER_DIED = 75  # EX_TEMPFAIL of sysexits.h
 
 
-class _Mode(ctypes.Structure):
+class Mode(ctypes.Structure):
+    """XRRModeInfo."""
+
     _fields_ = (
         ("id", c_ulong),
         ("width", c_uint),
@@ -52,7 +54,7 @@ class _Resources(ctypes.Structure):
         ("noutput", c_int),
         ("outputs", POINTER(c_ulong)),
         ("nmode", c_int),
-        ("modes", POINTER(_Mode)),
+        ("modes", POINTER(Mode)),
     )
 
 
@@ -190,7 +192,7 @@ def output_state(display: int, output: int) -> OutputState | None:
         if not state:
             return None
         place = state.contents
-        refresh_hz = {mode.id: _refresh_hz(mode) for mode in resources.contents.modes[: resources.contents.nmode]}
+        refresh_hz = {mode.id: refresh_rate_hz(mode) for mode in resources.contents.modes[: resources.contents.nmode]}
         output_now = OutputState(
             Rectangle(place.x, place.y, place.width, place.height),
             refresh_hz.get(place.mode, 0.0),
@@ -202,7 +204,8 @@ def output_state(display: int, output: int) -> OutputState | None:
         randr.XRRFreeScreenResources(resources)
 
 
-def _refresh_hz(mode: _Mode) -> float:
+def refresh_rate_hz(mode: Mode) -> float:
+    """Return how often a mode shows a picture, or a field of an interlaced one. 0 if unknown."""
     interlaced, double_scan = 0x10, 0x20
     lines = mode.v_total * (2.0 if mode.flags & double_scan else 1.0) / (2.0 if mode.flags & interlaced else 1.0)
     return float(mode.dot_clock / (mode.h_total * lines)) if mode.h_total and lines else 0.0

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from runtime.config import PanelSettings
 from runtime.errors import InputError, PanelLost
-from runtime.panels.monitors import Monitor, bind, check_modes, gamma_warning, refresh_difference
+from runtime.panels.monitors import Monitor, bind, check_modes, gamma_warning, in_order, refresh_difference
+from runtime.panels.xlib import Mode, refresh_rate_hz
 
 
 def monitor(connector: str, serial: str = "", x_px: int = 0) -> Monitor:
@@ -97,10 +98,30 @@ def test_panels_on_mirrored_or_overlapping_monitors_are_refused(place: tuple[int
     panels = [PanelSettings(connector="DP-1"), PanelSettings(connector="DP-2")]
     with pytest.raises(PanelLost, match=r"panels 0 and 1 would show the same pixels.*xrandr --output DP-2"):
         bind(panels, [first, second])
-    bind(panels, [first, replace(second, x_px=1920)])
+    for beside in ((1920, 0), (-1920, 0), (0, 1080), (0, -1080)):
+        apart = replace(second, x_px=beside[0], y_px=beside[1])
+        bind(panels, [first, apart])
+        assert in_order([first, apart]) == ((first, apart) if beside > (0, 0) else (apart, first))
 
 
 def test_a_changed_gamma_is_told_with_the_way_back() -> None:
     monitors = [Monitor(f"DP-{n}", "", "", 1920 * n, 0, 1920, 1080, 60.0, has_gamma=n == 1) for n in range(3)]
     assert gamma_warning(monitors[:1]) == ""
     assert "grey levels of DP-1" in gamma_warning(monitors) and "--output DP-1 --gamma 1:1:1" in gamma_warning(monitors)
+
+
+@pytest.mark.parametrize(
+    ("dot_clock", "h_total", "v_total", "flags", "expected_hz"),
+    [
+        (148_500_000, 2200, 1125, 0x5, 60.0),
+        (74_250_000, 2200, 1125, 0x15, 60.0),  # interlaced: two fields for a picture
+        (12_576_000, 800, 131, 0x25, 60.0),  # each line twice
+        (148_500_000, 0, 1125, 0, 0.0),
+        (148_500_000, 2200, 0, 0, 0.0),
+    ],
+)
+def test_a_mode_s_rate_follows_from_its_clock_and_lines(
+    dot_clock: int, h_total: int, v_total: int, flags: int, expected_hz: float
+) -> None:
+    mode = Mode(dot_clock=dot_clock, h_total=h_total, v_total=v_total, flags=flags)
+    assert refresh_rate_hz(mode) == pytest.approx(expected_hz)
