@@ -64,12 +64,15 @@ def intensity(values: tuple[float, float, float], real: RealPanels) -> F64:
     return Tables(layers, stack, real).light(crossed, 0.6)[0][0].astype(np.float64)
 
 
-def test_ideal_panels_give_the_solvers_own_figure() -> None:
-    layers, seen = smooth_layers(), sight()
+@pytest.mark.parametrize(("fov_deg", "sigma_mm"), [(4.0, 1.0), (4.0, 0.0), (16.0, 3.0)])  # at last beyond the panels
+def test_ideal_panels_give_the_solvers_own_figure(fov_deg: float, sigma_mm: float) -> None:
+    layers, seen = smooth_layers(), replace(sight(sigma_mm), fov_deg=fov_deg, seen_from_m=EYES + 0.004)
     ours = real_light(layers, STACK, RealPanels(), seen, RealSampling(rays=4)).light_db
-    at = {"eyes_m": EYES, "fov_deg": 4.0, "sigmas_mm": (1.0,)}
-    theirs = expected_psnrs_db(layers, seen.targets, STACK, sampling=Rays(rays=8), **at)[1.0]
+    at = {"eyes_m": EYES, "fov_deg": fov_deg, "sigmas_mm": (sigma_mm,), "seen_from_m": EYES + 0.004}
+    theirs = expected_psnrs_db(layers, seen.targets, STACK, sampling=Rays(rays=8), **at)[sigma_mm]
     assert ours == pytest.approx(theirs, abs=0.01)
+    some = real_light(layers, STACK, RealPanels(), seen, RealSampling(rays=4, step=2, thinned=True)).light_db
+    assert some == pytest.approx(theirs, abs=0.2)
 
 
 def test_jones_calculus_and_summed_angles_agree() -> None:
