@@ -258,6 +258,7 @@ def test_a_calm_head_is_expected_to_stay_calm_as_long_again() -> None:
         ([(0, 0, 0)], {"effort": None}, 0.03),
         ([(0, 0.004, 0)], {}, 1e-3 + 5.12e-3),  # 4 mm and 100 ms away
         ([(0, 0, 0)], {"people": (7,)}, 1e-3 + 4.386e-3),  # a single person gets the picture that is there
+        ([(0, 0, 0)], {"eyes_m": EYES[[0, 0]], "seeing": (True, False)}, 1e-3 + 4.386e-3),  # of whom one eye sees
         ([(0, 0, 0), (0, 0.3, 0)], {}, 0.03),  # the second one waits for a picture
     ],
 )

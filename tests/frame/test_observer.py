@@ -18,7 +18,6 @@ from runtime.config import Settings
 from runtime.content.base import ContentInfo, ContentSource, View
 from runtime.evaluation.displayed import displayed
 from runtime.evaluation.refresh_quality import RefreshTargets
-from runtime.frame import sampling
 from runtime.frame.measuring import Comparison, MeasuringProcess
 from runtime.frame.messages import Draw, Facts, Order
 from runtime.frame.observer import RunObserver
@@ -31,7 +30,7 @@ from runtime.optics.focus import retina_db
 from runtime.optics.presentation import shown_layers
 from runtime.plan.drawing import drawn_job, retina_pictures
 from runtime.plan.focusing import focus_targets, focused_job
-from runtime.records import Effort, PanelFrame, PersonAccount, RefreshAccount, SensorFrame, Solution, State
+from runtime.records import Effort, PanelFrame, RefreshAccount, SensorFrame, Solution, State
 from runtime.support.background import BACKGROUND_NICENESS, wait_for_all
 from tests.frame.conftest import SMALL
 from tests.frame.fakes import EYES, FakeSolver, aside, facts
@@ -272,21 +271,6 @@ def test_every_so_many_refreshes_are_sampled_while_tracking_and_no_others(
     assert observer.summary()["quality_frames"] == 3
 
 
-@pytest.mark.parametrize("change", [{"presented": False}, {"eyes_m": None}, {"flatness": 0.5}])
-def test_unseen_pictures_and_mixtures_with_the_flat_one_are_not_measured(
-    content: ContentSource, solved: Solution, change: dict[str, Any]
-) -> None:
-    observer, _ = looking(content, evaluate_every=1)
-    seen = refresh(1, solved)
-    if "flatness" in change:
-        seen = replace(seen, frame=replace(seen.frame, flat=solved.layers, flat_version=2, **change))
-    else:
-        seen = replace(seen, account=replace(seen.account, **change))
-    observer.refreshed(seen)
-    observer.finish()
-    assert observer.summary()["psnr_db"] is None
-
-
 def test_a_short_run_measures_its_last_refresh(content: ContentSource, solved: Solution) -> None:
     observer, _ = looking(content, evaluate_every=50)
     observer.refreshed(refresh(1, solved))
@@ -340,16 +324,6 @@ def test_in_real_time_one_measurement_runs_at_a_time_and_delays_nothing(
     assert wait_for_all(120.0) == 0
     observer.refreshed(refresh(10, solved))
     assert observer.summary()["quality_frames"] == 1
-
-
-def test_queued_layers_are_few_and_small(
-    content: ContentSource, solved: Solution, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sampling, "HELD_BYTES", 2 * solved.layers.nbytes)
-    observer, _ = looking(content, solver=Drawing(content, at_once=False), simulated=False, evaluate_every=1)
-    for number in range(20):
-        observer.refreshed(refresh(number, solved))
-    assert len(observer._sampler._waiting) == 2
 
 
 def test_another_process_finds_the_same_figures_and_its_end_costs_one(content: ContentSource, solved: Solution) -> None:
@@ -515,27 +489,6 @@ class Live:
 @pytest.fixture
 def live(content: ContentSource) -> Live:
     return Live(content)
-
-
-def test_a_live_figure_applies_to_these_eyes_and_this_state_alone(live: Live, solved: Solution) -> None:
-    there: dict[str, Any] = {"eyes_m": aside(0.02)}
-    live.measured(solved)
-    assert live.db(solved, **there) is None, "the figure of another position"
-    live.measured(solved, **there)
-    stale = live.light(solved, **there, state_version=1)
-    assert stale["light_db"] is None, "the scene or the model has changed, and the panels still show the old solution"
-    assert stale["light_age_s"] is None
-    live.measured(replace(solved, number=2, state_version=1), **there, state_version=1)
-    assert live.db(solved, **there) is None
-
-
-def test_a_live_figure_applies_until_either_of_two_people_moves(live: Live, solved: Solution) -> None:
-    def people(*places: Any) -> dict[str, Any]:
-        return {"people": tuple(PersonAccount(number, eyes_m, eyes_m) for number, eyes_m in enumerate(places, start=1))}
-
-    live.measured(solved, **people(EYES, aside(0.2)))
-    assert live.db(solved, **people(EYES, aside(0.22))) is None
-    assert live.db(solved, **people(EYES)) is None
 
 
 def test_a_live_figure_falls_where_depth_is_seen_from_elsewhere(live: Live, solved: Solution) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
 
@@ -12,7 +11,6 @@ import pytest
 
 from runtime.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from runtime.optics.alignment import align
-from runtime.plan.savings import selected_eyes
 from runtime.records import State
 from tests.frame import fakes
 from tests.frame.fakes import EYES, HZ, PERIOD_NS, STACK, Stage, aside, picture, solution
@@ -439,17 +437,6 @@ def test_panels_that_take_longer_than_a_period_are_told_by_the_presenter() -> No
     assert abs(told_now - now) <= 2
 
 
-def test_a_model_whose_rasters_are_not_timed_yet_stops_no_refresh(stage: Stage) -> None:
-    """A model is replaced on the solver's thread; the presenter may see it before its costs are known."""
-    stage.solver.offered = (1, 2, 3, 4)
-    stage.eyes = moves
-    stage.refresh(30)
-    assert {request.effort.reduction for request in stage.solver.requests[-30:]} == {1}
-    stage.solver.reductions, stage.solver.solve_cost_ns = (1, 2, 3, 4), 300 * NS_PER_MS
-    stage.refresh(30)
-    assert stage.solver.requests[-1].effort.reduction > 1
-
-
 def test_a_solver_that_has_not_started_yet_stops_no_refresh(stage: Stage) -> None:
     stage.solver.reductions = ()
     stage.eyes = moves
@@ -466,45 +453,6 @@ def test_a_display_of_a_few_hertz_stops_no_refresh(monkeypatch: pytest.MonkeyPat
     stage.eyes = moves
     stage.refresh(20)
     assert stage.solver.requests[-1].eyes_m is not None
-
-
-def test_a_head_that_has_rested_counts_as_one_that_never_moved() -> None:
-    """The speed before the rest says nothing about a head that stirs after it."""
-
-    def asked(before: Callable[[float], Any]) -> list[int]:
-        stage = Stage(plan={"enabled": True})
-        stage.solver.offered = stage.solver.reductions = (1, 2, 3, 4)
-        stage.solver.solve_cost_ns = 150 * NS_PER_MS
-        stage.eyes = lambda time_s: before(time_s) if time_s < 2.0 else aside(0.01 * max(time_s - 6.0, 0.0))
-        stage.refresh(6 * HZ)
-        assert stage.solver.requests[-1].eyes_label == "rested"
-        stage.refresh(HZ)
-        requests = stage.solver.requests[-HZ:]
-        assert requests[-1].eyes_label == "predicted"
-        return [request.effort.reduction for request in requests]
-
-    assert asked(lambda time_s: aside(0.5 * np.sin(4 * time_s))) == asked(lambda time_s: EYES)
-
-
-def test_a_viewer_of_whom_one_eye_sees_gets_no_coarser_solutions() -> None:
-    """The solution is for the left eye alone, whose place is not that of the midpoint."""
-    beside_m = np.array([[0.123, 0.43, 0.0], [0.078, 0.47, 0.0]])
-
-    def asked(seeing: tuple[bool, bool]) -> list[int]:
-        stage = Stage()
-        stage.solver.offered = stage.solver.reductions = (1, 2, 3, 4)
-        stage.solver.solve_cost_ns = 150 * NS_PER_MS
-        stage.eyes = lambda _: beside_m
-        for number in range(HZ):
-            stage.refresh()
-            request = stage.solver.requests[-1]
-            if request.eyes_m is not None:
-                eyes_m = selected_eyes(request.eyes_m, seeing)
-                made = solution(number + 2, eyes_m, time_ns=request.time_ns, effort=request.effort, seeing=seeing)
-                stage.solver.hand_over(solved=made)
-        return [request.effort.reduction for request in stage.solver.requests[HZ // 2 :]]
-
-    assert asked((True, False)) == asked((True, True))
 
 
 def test_a_moving_head_about_to_be_given_up_gets_no_long_solution(stage: Stage) -> None:

@@ -99,17 +99,14 @@ def of(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Sampled]:
     return made
 
 
-def test_a_tenth_of_a_run_at_most_is_spent_on_measuring(of: Callable[..., Sampled]) -> None:
+def test_measuring_is_followed_by_a_pause_in_proportion(of: Callable[..., Sampled]) -> None:
+    """A tenth of a run is spent on it, and three tenths of a live page's, here with a new solution at each refresh."""
     sampled = of()
     assert sampled.shows(0) == 1
     sampled.now_s = 1.5
     sampled.drawn()
     assert sampled.shows(1, at_s=2.0) == sampled.shows(2, at_s=19.99) == 0 and sampled.measured == [0]
     assert sampled.shows(3, at_s=20.01) == 1
-
-
-def test_three_tenths_of_a_live_run_are_spent_on_measuring(of: Callable[..., Sampled]) -> None:
-    """Each refresh shows another solution."""
     sampled = of(newest=True)
     assert [sampled.shows(n, at_s=n / 10, of=n) for n in range(4)] == [0, 0, 0, 1]
     sampled.drawn()
@@ -155,7 +152,12 @@ def test_a_figure_of_an_earlier_solution_ends_once_another_has_settled(of: Calla
         assert (sampled.sampler.figure_of(sampled.shown) is not None) == has_figure
 
 
-def test_of_refreshes_due_meanwhile_the_newest_and_a_few_others_are_measured(of: Callable[..., Sampled]) -> None:
+@pytest.mark.parametrize(("most", "others"), [(9, 4), (3, 2)])
+def test_of_refreshes_due_meanwhile_the_newest_and_a_few_others_are_measured(
+    of: Callable[..., Sampled], monkeypatch: pytest.MonkeyPatch, most: int, others: int
+) -> None:
+    """At most five, or as many as have few bytes."""
+    monkeypatch.setattr(sampling, "HELD_BYTES", most * solution(1).layers.nbytes)
     sampled = of()
     sampled.shows(0)
     sampled.drawn()
@@ -164,13 +166,13 @@ def test_of_refreshes_due_meanwhile_the_newest_and_a_few_others_are_measured(of:
         assert sampled.shows(number, at_s=number / 10) == 0
     Job.are_done, sampled.draws_from_s = True, 4.0
     sampled.sampler.drain(lambda: False)
-    first, newest, *others = sampled.measured
-    assert (first, newest, len(others)) == (0, 39, 4) and others == sorted(others, reverse=True)
-    assert others != [38, 37, 36, 35], "not only the latest"
+    first, newest, *later = sampled.measured
+    assert (first, newest, len(later)) == (0, 39, others) and later == sorted(later, reverse=True)
+    assert later != [38, 37, 36, 35][:others], "not only the latest"
     moment = sampled.sampler.moment
     assert moment is not None and moment.account is not None and moment.account.frame == 39
     assert sampled.sampler.summary()["psnr_db"] == pytest.approx(30 + np.mean(sampled.measured), abs=0.001)
-    assert sampled.sampler.summary()["quality_frames"] == 6
+    assert sampled.sampler.summary()["quality_frames"] == 2 + others
 
 
 def test_after_the_run_a_minute_is_the_most_that_is_waited(of: Callable[..., Sampled]) -> None:
