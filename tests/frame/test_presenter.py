@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -350,12 +351,13 @@ def test_a_lost_sensor_is_named(stage: Stage) -> None:
     stage.samples.why = "unplugged"
     stage.refresh()
     assert stage.presenter.machine.name == "degraded: sensor"
+    assert stage.presenter.status.sensor_hz is None
     stage.samples.why = "unplugged for 2 s"
     stage.refresh()
     stage.samples.why = ""
     stage.refresh()
     assert stage.presenter.machine.state is State.TRACKING
-    assert stage.presenter.stats.faults == {"sensor": 1}
+    assert stage.presenter.stats.faults == {"sensor": 1} and stage.presenter.status.sensor_hz == 60.0
 
 
 def test_no_refresh_waits_for_the_solver() -> None:
@@ -384,6 +386,13 @@ def test_a_solution_ran_at_its_first_refresh_and_is_reused_later(stage: Stage) -
         "render": 8.0, "prepare": 0.0, "inference": 3.0, "finish": 0.0,
     }  # fmt: skip
     assert set(told[1].stage_ms) == {"wait", "sensor", "track", "present"}
+
+
+def test_time_that_a_drawn_frame_is_held_back_counts_as_waiting(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    present = stage.panels.present
+    monkeypatch.setattr(stage.panels, "present", lambda *one, **how: replace(present(*one, **how), held_ns=400_000))
+    stage_ms = stage.presenter.refresh().stage_ms
+    assert (stage_ms["present"], stage_ms["wait"]) == pytest.approx((0.6, 0.4))
 
 
 def test_frames_are_numbered_and_counted_and_a_run_ends_after_so_many(stage: Stage) -> None:

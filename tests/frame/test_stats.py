@@ -60,6 +60,7 @@ def test_display_time_is_counted_by_effort() -> None:
 def test_the_estimated_view_error_starts_from_the_trackers_eyes() -> None:
     eyes_m = np.array([[0.6, -0.03, 0.0], [0.6, 0.03, 0.0]])
     moved = [account(k, eyes_m=eyes_m + np.array([0.0, 0.001 * k, 0.0]), solved_for_m=eyes_m) for k in range(101)]
+    moved.append(account(101, eyes_m=eyes_m))  # without a solution
     assert told(moved).summary(stale_inputs=0)["view_error_estimated_mm"] == pytest.approx({"p50": 50.0, "p95": 95.0})
 
 
