@@ -74,7 +74,7 @@ def test_rays_that_miss_the_panels_have_no_error() -> None:
     )
 
 
-CARD_X_M = 0.05  # distance of a plane before the middle panel
+CARD_X_M = 0.4  # distance of a plane before the middle panel
 
 
 def card(eyes_m: np.ndarray, *, first: tuple[int, int] = (0, 0), relief: float | None = None) -> Job:
@@ -116,21 +116,18 @@ def change_of(before: Job, after: Job, *, times_ns: tuple[int, int] = (0, 0)) ->
 
 
 @pytest.mark.parametrize("first", [(0, 0), (21, 13)], ids=["whole", "window"])
-@pytest.mark.parametrize("moved_m", [(0.0, 0.03, 0.0), (0.0, 0.0, -0.03), (0.08, 0.0, 0.0), (0.05, -0.03, 0.02)])
-def test_pictures_are_compared_as_the_panels_show_them_to_moved_eyes(
-    moved_m: tuple[float, float, float], first: tuple[int, int]
-) -> None:
-    eyes_m, relief = EYES - np.array([0.0, 0.0, 0.02]), CARD_X_M / (0.6 - CARD_X_M)
+def test_pictures_are_compared_as_the_panels_show_them_to_moved_eyes(first: tuple[int, int]) -> None:
+    """Eyes that coincide come nearer, so that all that they see was seen before."""
     for people in (1, 2):
-        before_m = np.tile(eyes_m, (people, 1))
-        after_m = before_m + np.array(moved_m)
+        before_m = np.tile([1.2, 0.0, 0.02], (2 * people, 1))
+        after_m = before_m + np.array([-0.6, 0.03, -0.02])
         known, unknown = (
-            change_of(card(before_m, first=first, relief=each), card(after_m, first=first)) for each in (relief, None)
+            change_of(card(before_m, first=first, relief=each), card(after_m, first=first)) for each in (0.5, None)
         )
         assert known is not None and unknown is not None
-        assert 0.0 < known[0] < 0.3 * unknown[0], "except at the picture's edges"
+        assert known[0] < 1e-4 and unknown[0] > 0.05
     after_m[:2] = before_m[:2]  # one of the two stays, and the panels follow nobody
-    assert change_of(card(before_m, first=first, relief=relief), card(after_m, first=first)) == pytest.approx(
+    assert change_of(card(before_m, first=first, relief=0.5), card(after_m, first=first)) == pytest.approx(
         change_of(card(before_m, first=first), card(after_m, first=first))
     )
 

@@ -545,12 +545,19 @@ def test_a_live_sensor_s_pictures_are_drawn_during_the_run(content: ContentSourc
 def test_who_stops_a_run_waits_for_no_kept_picture(
     content: ContentSource, solved: Solution, caplog: pytest.LogCaptureFixture
 ) -> None:
-    solver = Drawing(content, at_once=False)  # busy
+    solver = Drawing(content)
     observer, kept = looking(content, solver=solver, keep_light=1)
     for number in range(3):
         observer.sampled(sample(NS_PER_S + number * PERIOD_NS))
         observer.refreshed(refresh(number, solved))
-    observer.finish(lambda: True)
-    assert "3 of 3 refreshes kept by --keep-light have no" in caplog.text
+
+    def stopped() -> bool:
+        """Once the first is drawn, and the solver is busy with the second."""
+        solver.at_once = "drawn" not in kept.lights[0]
+        return bool(solver.orders)
+
+    observer.finish(stopped)
+    assert "2 of 3 refreshes kept by --keep-light have no" in caplog.text
     assert all({"layers", "info"} <= light.keys() for light in kept.lights.values())
+    assert [light["drawn"] is not None for light in kept.lights.values()] == [True, False, False]
     assert kept.lights[2]["info"]["true_eyes_m"] is not None
