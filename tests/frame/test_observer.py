@@ -22,7 +22,9 @@ from runtime.frame.measuring import Comparison, MeasuringProcess
 from runtime.frame.messages import Draw, Facts, Order
 from runtime.frame.observer import RunObserver
 from runtime.frame.refresh import Refresh
+from runtime.frame.refresh_lines import RefreshLines
 from runtime.frame.targets import TargetDrawer, drawn
+from runtime.frame.truth import TrueEyes
 from runtime.model.predictor import Predictor
 from runtime.optics.alignment import align
 from runtime.optics.carried import carried_db, expected_psnrs_db, intensities
@@ -30,7 +32,7 @@ from runtime.optics.focus import retina_db
 from runtime.optics.presentation import shown_layers
 from runtime.plan.drawing import drawn_job, retina_pictures
 from runtime.plan.focusing import focus_targets, focused_job
-from runtime.records import Effort, PanelFrame, RefreshAccount, SensorFrame, Solution, State
+from runtime.records import Effort, PanelFrame, PersonAccount, RefreshAccount, SensorFrame, Solution, State
 from runtime.support.background import BACKGROUND_NICENESS, wait_for_all
 from tests.frame.conftest import SMALL
 from tests.frame.fakes import EYES, FakeSolver, aside, facts
@@ -186,6 +188,18 @@ def test_of_2048_lines_that_wait_the_oldest_is_written(content: ContentSource) -
     assert kept.lines == []
     observer.refreshed(refresh(2048, None))
     assert [line["frame"] for line in kept.lines] == [1] and kept.lines[0]["true_eyes_m"] is None
+
+
+def test_view_errors_are_each_person_s_or_the_one_s_served_last(solved: Solution) -> None:
+    lines = RefreshLines(TrueEyes(), None)
+    known = PersonAccount(4, EYES, EYES, aside(0.02)), PersonAccount(2, EYES, None, EYES), PersonAccount(3, EYES, EYES)
+    tellings: list[dict[str, Any]] = [{"true_eyes_m": aside(0.01)}, {"people": known}, {"true_eyes_m": aside(0.04)}]
+    for told in tellings:
+        lines.add(refresh(1, solved, **told).account)
+        lines.advance()
+    by_person = {number: errors.of("p50") for number, errors in lines.people_mm.items()}
+    assert by_person == {1: {"p50": 10.0}, 4: {"p50": 30.0}}
+    assert lines.view_error_mm.of("p50", "max") == {"p50": 20.0, "max": 40.0}
 
 
 # --- sampled quality ---------------------------------------------------------------------------------------------
