@@ -245,7 +245,7 @@ def model(settings: Settings) -> Iterator[Row]:
 
     cv2.setNumThreads(settings.model.threads or -1)
     predictor = load_predictor(settings.model.name, settings.stack.stack(), settings.model)
-    name = predictor.name
+    name = predictor.facts.name
     with ExitStack() as cleanup:
 
         def context() -> Any:
@@ -271,8 +271,8 @@ def _rate(predictor: Predictor, backend: SolverBackend, settings: Settings) -> R
 
     stack = predictor.stack
     raster = f"{stack.width_px}x{stack.height_px}"
-    if not predictor.has_devices:
-        return Row("rate", "skip", f"cannot time the model {predictor.name}")
+    if not predictor.facts.has_devices:
+        return Row("rate", "skip", f"cannot time the model {predictor.facts.name}")
     coarse = replace(stack, width_px=max(64, stack.width_px // 4), height_px=max(64, stack.height_px // 4))
     took_ms, how = 16 * solution_ms(predictor, coarse, backend, runs=3), f"estimated from {coarse.width_px} columns"
     if took_ms < MEASURED_MS:

@@ -129,7 +129,7 @@ def solve_pictures(
         try:
             done = timed(solve, runs=repeat)
         except EyesNotServed as error:  # permanent, because the eyes of a still pair do not move
-            why = f"{predictor.name} does not support these eye positions ({error}); try --model sart"
+            why = f"{predictor.facts.name} does not support these eye positions ({error}); try --model sart"
             raise InputError("solve", "--left-eye, --right-eye", why) from None
         watch.lap("solve, warm-up included")
         with OutputFolder(out) as folder:
@@ -155,7 +155,7 @@ def solve_pictures(
                 "inference_ms": round(float(np.median(inference_ms[-repeat:])), 3),
                 "total_ms": round(done.median_ms, 3),
                 "model": predictor.name_with(len(pictures)),
-                "provider": predictor.provider,
+                "provider": predictor.facts.provider,
                 "backend": predictor.backend,
                 "eye_sigma_mm": eye_sigma_mm,
                 "steps": done.answer.steps + 1,  # the network's initial layers count as one

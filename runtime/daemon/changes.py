@@ -229,7 +229,7 @@ class Changes:
             moved = moved_since(loading.settings.content, facts.settings.content)  # moved during loading
             if not loading.superseded:
                 self.choices = loading.choices.choosing("content", **moved)
-            log.info("now showing the scene %s with the model %s", facts.info.name, facts.model)
+            log.info("now showing the scene %s with the model %s", facts.info.name, facts.model.name)
         if not loading.superseded:
             self.answer(loading.command, problem)
 

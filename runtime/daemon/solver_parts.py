@@ -163,11 +163,7 @@ class RunningSolver:
             state.scene,
             state.settings,
             state.content.info,
-            predictor.name,
-            predictor.provider,
-            tuple(predictor.reductions),
-            predictor.steps,
-            predictor.refined_steps,
+            predictor.facts,
             predictor.backend,
             self.backend.why,
         )
@@ -184,7 +180,7 @@ class RunningSolver:
 
     def simulated_costs(self) -> Costs:
         return simulated_costs(
-            self.solver.state.settings.loop.simulated_stage_ms, self.solver.state.predictor.reductions
+            self.solver.state.settings.loop.simulated_stage_ms, self.solver.state.predictor.facts.reductions
         )
 
     def first_costs(self, *, time_ns: int) -> Mapping[int, Mapping[str, float]]:
@@ -198,7 +194,7 @@ class RunningSolver:
         costs: dict[int, dict[str, float]] = {}
         eyes_m = trial_eyes_m(predictor.stack)
         try:
-            for reduction in predictor.reductions:
+            for reduction in predictor.facts.reductions:
                 count = TRIALS[reduction > 1]
                 runs = [self.solver.trial_ms(eyes_m, reduction, time_ns=time_ns) for _ in range(count)]
                 costs[reduction] = {stage: min(run.get(stage, 0.0) for run in runs) for stage in runs[0]}

@@ -43,7 +43,7 @@ def holds(facts: Facts, *, paused: bool, flat_asked: bool) -> dict[str, Any]:
     return {
         "scene": facts.settings.content.scene,
         "content": facts.info.name,
-        "model": facts.model,
+        "model": facts.model.name,
         "placing": placing_in(facts.settings),
         "paused": paused,
         "flat_asked": flat_asked,
@@ -90,7 +90,7 @@ def snapshot(status: Status, run: Run) -> dict[str, Any]:
         "playlist": live.playlist,
         "plan": run.plan_items(facts, live),
         "model_asked": facts.settings.model.name,
-        "provider": facts.provider,
+        "provider": facts.model.provider,
         "backend": facts.backend,
         "backend_why": facts.backend_why,
         "panels": run.presenter.panels.name,

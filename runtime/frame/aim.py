@@ -80,9 +80,9 @@ class Aim:
         begins_ns = min(max(self._solver.free_ns(now_ns), now_ns), now_ns + self._period_ns)  # else replaced by then
         slots = Slots(timing.photon_ns, composed_ns, begins_ns, self._period_ns)
         facts, refined, costs = self._solver.facts, None, self._solver.costs.for_people(len(eyes.people))
-        whole = self._fixed or Effort(1, facts.steps)
+        whole = self._fixed or Effort(1, facts.model.steps)
         effort, expected_m2 = whole, 0.0
-        timed = tuple(by for by in facts.reductions if by in costs.stages)  # a new model may lack timings
+        timed = tuple(by for by in facts.model.reductions if by in costs.stages)  # a new model may lack timings
         if timed and eyes.eyes_m is not None and settings.model.effort == "auto":
             outlook = self._outlook(slots, eyes)
             horizon_s = self._horizon_s(timing, speed_m_s=outlook(0.0).speed_m_s)
@@ -90,12 +90,12 @@ class Aim:
             period_ms = self._period_ns / NS_PER_MS
             if eyes.label != "held" or self._seen_effort is None or self._seen_effort.reduction not in timed:
                 self._seen_effort = self._chooser.choose(
-                    candidates(timed, facts.steps),
+                    candidates(timed, facts.model.steps),
                     costs, outlook, shown_error=error, period_ms=period_ms, horizon_s=horizon_s,
                 )  # fmt: skip
             effort = self._seen_effort
             if shown is not None and eyes.label == "rested":
-                most = facts.refined_steps
+                most = facts.model.refined_steps
                 refined = self._refined(shown, most, costs, shown_error=error, horizon_s=horizon_s)
                 if refined is None and len(eyes.people) < 2 and may_focus(facts.info, settings.content.focus):
                     refined = focused(shown, most, costs, horizon_s=horizon_s)

@@ -14,6 +14,7 @@ from runtime.config import Settings
 from runtime.content.base import ContentInfo
 from runtime.evaluation.refresh_quality import RefreshTargets
 from runtime.frame.effort import Costs
+from runtime.model.base import ModelFacts
 from runtime.plan.savings import Measured
 from runtime.records import F64, Effort, Solution
 
@@ -74,11 +75,7 @@ class Facts:
     scene: int  # changes whenever the content is replaced or moved
     settings: Settings
     info: ContentInfo  # a playlist changes it
-    model: str  # name to show
-    provider: str
-    reductions: tuple[int, ...]  # rasters that the model can solve on
-    steps: int  # updates of all panels in a full solution
-    refined_steps: int  # most updates of a solution that is continued
+    model: ModelFacts
     backend: str
     backend_why: str
 

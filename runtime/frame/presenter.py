@@ -388,8 +388,8 @@ class Presenter:
         facts = self.solver.facts
         return {
             **self.stats.summary(stale_inputs=self.samples.stale_inputs, simulated=simulated),
-            "model": facts.model,
-            "provider": facts.provider,
+            "model": facts.model.name,
+            "provider": facts.model.provider,
             "states": self.machine.seconds(now_ns=self.clock.now_ns()),
         }
 

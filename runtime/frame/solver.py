@@ -100,7 +100,10 @@ class Solver:
             return self._draw_flat(revision=revision, time_ns=time_ns)
         if job.eyes_m is not None:
             wanted = request.refined_to if job.kind == "refine" else request.effort
-            offered, steps = state.predictor.reductions, state.predictor.steps  # may be those of a new model
+            offered, steps = (
+                state.predictor.facts.reductions,
+                state.predictor.facts.steps,
+            )  # may be those of a new model
             if wanted is None or wanted.reduction not in offered:
                 wanted = Effort(1, steps)
             elif job.kind == "solve":

@@ -43,8 +43,8 @@ def choose(wanted: Wanted, predictor: Predictor, context: Callable[[], Any]) -> 
     if needed. If `wanted` is `gl`, raises MissingPart without OpenGL, and InputError if a panel is too large for its
     driver.
     """
-    if not predictor.has_devices:
-        choice = Choice(_cpu(), f"the only backend that supports {predictor.name}")
+    if not predictor.facts.has_devices:
+        choice = Choice(_cpu(), f"the only backend that supports {predictor.facts.name}")
     elif wanted == "cpu":
         choice = Choice(_cpu(), "as configured")
     elif wanted == "gl":

@@ -43,20 +43,27 @@ class Prediction:
     continued_from: int | None = None  # how many of `steps` earlier solutions made; None: no solution was continued
 
 
+@dataclass(frozen=True, slots=True)
+class ModelFacts:
+    """Properties of a model, on any device and with panels of any size."""
+
+    name: str  # as shown to the user
+    provider: str
+    parameters: int = 0
+    precision: str = "fp32"  # precision of the network's weights and arithmetic
+    has_devices: bool = False  # True if the device can be chosen (`Predictor.bound`)
+    trims: bool = False  # True if the model can solve just a window or a single channel (`trim`)
+    reductions: tuple[int, ...] = (1,)  # supported rasters, given as divisors of the display's rows and columns
+    steps: int = 0  # updates of all panels in a full solution
+    refined_steps: int = 0  # total number of updates that a continued solution can reach
+
+
 class Predictor(ABC):
     """Model that computes the layers for a job. A predictor may be used by only one thread."""
 
-    name: str
-    provider: str
-    parameters: int
-    precision: str = "fp32"  # precision of the network's weights and arithmetic
+    facts: ModelFacts
     stack: PanelStack  # the display's geometry
     backend: str = "cpu"  # device that runs everything except the network
-    has_devices: bool = False  # True if this device can be chosen (`bound`)
-    trims: bool = False  # True if the model can solve just a window or a single channel (`trim`)
-    reductions: tuple[int, ...] = (1,)  # supported rasters, given as divisors of the display's rows and columns
-    steps: int = 0  # updates of all panels in a solution
-    refined_steps: int = 0  # total number of updates that a continued solution can reach
 
     def reads_textures_of(self, context: object) -> bool:
         """Return True if `solve` accepts pictures held in this OpenGL context's textures (`DrawnPicture`)."""
@@ -64,7 +71,7 @@ class Predictor(ABC):
 
     def name_with(self, views: int) -> str:
         """Return the model's name, with a note if its network does not serve this many views."""
-        return self.name
+        return self.facts.name
 
     def bound(
         self, *, backend: SolverBackend | None = None, stack: PanelStack | None = None, slots: LayerSlots | None = None
@@ -87,7 +94,7 @@ class Predictor(ABC):
 def warm_up(predictor: Predictor) -> dict[int, dict[str, float]]:
     """Solve grey pictures in one step on every raster, to allocate memory. Return stage times by raster."""
     measured, eyes_m = {}, trial_eyes_m(predictor.stack)
-    for reduction in predictor.reductions:
+    for reduction in predictor.facts.reductions:
         job = replace(grey_job(eyes_m, predictor.stack.reduced(reduction)), steps=1)
         predictor.solve(job)
         runs = [predictor.solve(job).stage_ms for _ in range(min(reduction, 3))]  # other processes may delay a run

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from runtime.clock import Stopwatch
 from runtime.errors import ModelFailure
 from runtime.kernels import FULL
-from runtime.model.base import STAGES, Prediction, Predictor
+from runtime.model.base import STAGES, ModelFacts, Prediction, Predictor
 from runtime.model.geometry import panel_from_middle
 from runtime.model.job import Job
 from runtime.model.targets import target_table
@@ -33,9 +33,7 @@ RELAXATION = 1.7  # factor for the views' mean residual, found by trial and erro
 class SartPredictor(Predictor):
     """The model `sart`, which computes in float32 for any stack and rounds the result to 8 bits."""
 
-    name = "sart"
-    provider = "numpy"
-    parameters = 0
+    facts = ModelFacts("sart", "numpy")
 
     def __init__(self, stack: PanelStack, *, iterations: int = ITERATIONS) -> None:
         self.stack, self.iterations = stack, iterations

@@ -15,7 +15,7 @@ import numpy as np
 
 from runtime.clock import Stopwatch
 from runtime.kernels import FULL
-from runtime.model.base import STAGES, Prediction, Predictor
+from runtime.model.base import STAGES, ModelFacts, Prediction, Predictor
 from runtime.model.buffers import LayerBuffer, LayerPool, LayerSlots
 from runtime.model.contract import Places, Step
 from runtime.model.cpu import CpuBackend
@@ -97,18 +97,20 @@ class StepPredictor(Predictor):
         """Create a model that is shown to the user as `name`, by default on the processor. Without a proposal, the
         panels to start from are solved on coarser rasters. Layers are written to `slots`, if given.
         """
-        self.stack, self.name, self._proposal, self._steps = stack, name, proposal, tuple(steps)
+        self.stack, self._proposal, self._steps, self._threads = stack, proposal, tuple(steps), threads
         self._steps_from_even = self._steps if proposal is None else steps_from_even(len(self._steps))
-        self.provider, self.parameters, self._threads = "cpu", 0, threads
-        if proposal is not None:
-            contract = proposal.session.contract
-            self.provider = proposal.session.provider
-            self.parameters, self.precision = contract.parameters, contract.precision
-        self.any_raster = self.has_devices = proposal is None or proposal.any_raster
-        self.trims = proposal is not None and proposal.any_raster
-        self.reductions = REDUCTIONS if self.any_raster else (1,)
-        self.steps = len(self._steps)
-        self.refined_steps = max(self.steps, REFINED_STEPS)
+        self._any_raster = proposal is None or proposal.any_raster
+        self.facts = ModelFacts(
+            name,
+            "cpu" if proposal is None else proposal.session.provider,
+            0 if proposal is None else proposal.session.contract.parameters,
+            "fp32" if proposal is None else proposal.session.contract.precision,
+            has_devices=self._any_raster,
+            trims=proposal is not None and proposal.any_raster,
+            reductions=REDUCTIONS if self._any_raster else (1,),
+            steps=len(self._steps),
+            refined_steps=max(len(self._steps), REFINED_STEPS),
+        )
         self._backend: SolverBackend = backend or CpuBackend()
         self._states: dict[PanelStack, SolverState] = {}
         self._pools: dict[PanelStack, LayerPool] = {}
@@ -124,15 +126,14 @@ class StepPredictor(Predictor):
         return context is not None and self._backend.context is context
 
     def name_with(self, views: int) -> str:
-        return (
-            self.name if views == 2 or self._proposal is None else f"{self.name} (without its network: needs two views)"
-        )
+        served = views == 2 or self._proposal is None
+        return self.facts.name if served else f"{self.facts.name} (without its network: needs two views)"
 
     def bound(
         self, *, backend: SolverBackend | None = None, stack: PanelStack | None = None, slots: LayerSlots | None = None
     ) -> StepPredictor:
         return StepPredictor(
-            stack or self.stack, self._proposal, self._steps, name=self.name, threads=self._threads,
+            stack or self.stack, self._proposal, self._steps, name=self.facts.name, threads=self._threads,
             backend=backend or self._backend, slots=slots or self._slots,
         )  # fmt: skip
 
@@ -145,7 +146,7 @@ class StepPredictor(Predictor):
         buffer, rest, window = pool.take(), rest_code(job.stack.count), job.window
         done = _Improved(0)
         if window is None:  # solve everything the eyes see, or all pixels if the network proposes whole panels
-            geometry = job.targets.visible if self.any_raster else job.targets.every_pixel
+            geometry = job.targets.visible if self._any_raster else job.targets.every_pixel
             done = self._improve(job, geometry, state, buffer, watch, outside=rest)
         else:
             if window.colour is None or not window.box.width_px:  # fill with the picture that both eyes see

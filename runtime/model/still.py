@@ -40,7 +40,7 @@ def solve_still(
     codes = [np.ascontiguousarray(picture[..., :3]) for picture in pictures]
     views = captured_views(codes, eyes_m, predictor.stack, fov_deg=fov_deg)
     job = Job(Targets(predictor.stack, eyes_m, views), eye_sigma_m=eye_sigma_mm / 1e3, steps=steps, floats=floats)
-    if trimmed and len(views) > 1 and not floats and predictor.trims:
+    if trimmed and len(views) > 1 and not floats and predictor.facts.trims:
         job = trim(job)
     watch.lap("prepare")
     return predictor.solve(job, watch)

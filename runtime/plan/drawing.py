@@ -69,7 +69,7 @@ def drawn_job(
     the scene does not need, even drawing outside a known extent; `before` is the previous window on this raster.
     `in_depth` includes relief, if the depth is known. Raises ContentFailure if drawing fails, and ContextLost.
     """
-    stack, trimmed = predictor.stack.reduced(reduction), trimmed and predictor.trims
+    stack, trimmed = predictor.stack.reduced(reduction), trimmed and predictor.facts.trims
     window: SolveWindow | None = None
     raster = stack.panel(stack.count // 2)
     if trimmed and content.info.background is not None:

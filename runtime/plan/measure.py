@@ -126,7 +126,7 @@ def plan_for(config: Path | None, *, scene: str | None, model: str | None, scale
         drift_db = numbers.reuse.costs_db if reused else None
         return {
             "scene": content.info.name,
-            "model": predictor.name,
+            "model": predictor.facts.name,
             "backend": predictor.backend,
             "width_px": stack.width_px,
             "height_px": stack.height_px,

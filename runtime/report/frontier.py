@@ -235,7 +235,7 @@ def run_method(method: Method, pair: StillPair, threads: int) -> MethodRun:
         slow_s=SLOW_S,
     )
     layers, peak_mib = np.array(done.answer[..., :3]), _peak_mib()
-    return MethodRun(layers, done.times_ms, peak_mib, predictor.parameters, predictor.precision)
+    return MethodRun(layers, done.times_ms, peak_mib, predictor.facts.parameters, predictor.facts.precision)
 
 
 def _peak_mib() -> float:

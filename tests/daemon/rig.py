@@ -236,7 +236,7 @@ class BreakablePredictor:
     """Any predictor; `answer`, where set, is called in its place."""
 
     def __init__(self, predictor: Any) -> None:
-        self._predictor, self.name, self.provider = predictor, predictor.name, predictor.provider
+        self._predictor = predictor
         self.answer: Callable[..., Any] | None = None
 
     def solve(self, job: Any, watch: Any = None) -> Any:

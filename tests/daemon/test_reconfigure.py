@@ -154,12 +154,12 @@ def test_what_is_decided_anew_for_every_solution_loads_no_model(bench: Bench) ->
 
 def test_costs_are_calibrated_with_the_scene_once_for_each_model(bench: Bench) -> None:
     first = bench.parts.first_costs(time_ns=0)
-    assert set(first) == set(bench.state.predictor.reductions)
+    assert set(first) == set(bench.state.predictor.facts.reductions)
     assert all(stages["render"] > 0 and stages["finish"] > 0 for stages in first.values())
     assert bench.parts.first_costs(time_ns=0) is first
     bench.advance(bench.change(settings(**MODEL)))
     after = bench.parts.first_costs(time_ns=0)
-    assert after is not first and set(after) == set(bench.state.predictor.reductions)
+    assert after is not first and set(after) == set(bench.state.predictor.facts.reductions)
 
 
 def test_a_stack_that_reaches_past_the_usual_eyes_is_warmed_up() -> None:
@@ -176,7 +176,7 @@ def test_content_that_cannot_be_drawn_yet_leaves_the_costs_of_warm_up(bench: Ben
 
     bench.first_content.draw = missing  # type: ignore[attr-defined]
     costs = bench.parts.first_costs(time_ns=0)
-    assert set(costs) == set(bench.state.predictor.reductions)
+    assert set(costs) == set(bench.state.predictor.facts.reductions)
     assert all("render" not in stages and stages["step"] > 0 for stages in costs.values())
     del bench.first_content.draw  # type: ignore[attr-defined]
     assert bench.solve() is not None

@@ -145,7 +145,7 @@ def test_the_next_solver_takes_up_scene_model_and_place_as_last_set(rig: Rig) ->
         restarts = solver.restarts
         os.kill(solver_pid(rig.presenter), signal.SIGSEGV)
         until_replaced(rig, restarts)
-        assert (solver.facts.info.name, solver.facts.model) == (facts.info.name, "balanced")
+        assert (solver.facts.info.name, solver.facts.model.name) == (facts.info.name, "balanced")
         assert solver.facts.settings.content.scale == 1.5 and solver.facts.settings == facts.settings
         assert solver.costs.stages.keys() == costs.stages.keys()
     finally:

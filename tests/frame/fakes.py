@@ -19,6 +19,7 @@ from runtime.frame.presenter import Presenter
 from runtime.frame.refresh import Refresh
 from runtime.frame.solver_host import SolverHost
 from runtime.frame.viewer import Viewer
+from runtime.model.base import ModelFacts
 from runtime.optics.stack import PanelStack
 from runtime.panels.base import PanelSink
 from runtime.records import Effort, EyePoints, PanelFrame, PresentReport, SensorFrame, Solution, SolveRequest
@@ -78,13 +79,9 @@ class FakeSamples(Samples):
         """Do nothing."""
 
 
-def facts(settings: Settings, **changes: Any) -> Facts:
-    """Of a model without steps that solves on the full raster."""
-    named: dict[str, Any] = {"model": "model", "provider": "none", "reductions": (1,), "steps": 0, "refined_steps": 0}
-    more = {"backend": "cpu", "backend_why": ""}
-    return Facts(
-        **({"version": 0, "scene": 1, "settings": settings, "info": ContentInfo("content")} | named | more | changes)
-    )
+def facts(settings: Settings, *, scene: int = 1, **offers: Any) -> Facts:
+    """Of a model that offers no steps and only the full raster, unless told."""
+    return Facts(0, scene, settings, ContentInfo("content"), ModelFacts("model", "none", **offers), "cpu", "")
 
 
 class FakeSolver(SolverHost):

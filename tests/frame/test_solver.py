@@ -127,8 +127,8 @@ def test_after_its_budget_no_further_step_begins_but_on_a_simulated_clock(solver
 
 def test_no_more_steps_are_made_than_the_model_has(solver: Solver, predictor: Predictor) -> None:
     """The presenter may not have seen yet that the model was replaced."""
-    solution = solver.step(replace(wish(), effort=Effort(2, predictor.steps + 6))).solution
-    assert solution.effort == Effort(2, predictor.steps)
+    solution = solver.step(replace(wish(), effort=Effort(2, predictor.facts.steps + 6))).solution
+    assert solution.effort == Effort(2, predictor.facts.steps)
 
 
 def test_a_coarse_solution_is_not_continued_in_place_of_an_earlier_one(solver: Solver) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from runtime.clock import SimulatedClock
 from runtime.model import backends
 from runtime.model.backends import choose
+from runtime.model.base import ModelFacts
 from runtime.model.gl import state
 from runtime.model.job import Job
 from runtime.optics.stack import PanelStack
@@ -28,7 +30,7 @@ class Gl:
 class Timed:
     """A model whose solutions take the times of their backend and raster, one after the other."""
 
-    name, has_devices = "timed", True
+    facts = ModelFacts("timed", "numpy", has_devices=True)
 
     def __init__(self, clock: SimulatedClock, stack: PanelStack, times_ms: dict[str, list[float]]) -> None:
         self.clock, self.stack, self.times_ms, self.closed = clock, stack, times_ms, 0
@@ -77,3 +79,5 @@ def test_the_second_comparison_decides_unless_the_first_is_clear(
     for configured in ("cpu", "gl"):
         choice = choose(configured, model, object)  # type: ignore[arg-type]
         assert (choice.backend.name, choice.why) == (configured, "as configured")
+    model.facts = replace(model.facts, has_devices=False)
+    assert choose("gl", model, object).why == "the only backend that supports timed"

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime.model.base import trial_eyes_m, warm_up
+from runtime.model.base import ModelFacts, trial_eyes_m, warm_up
 from runtime.model.job import Job, SolveWindow, Targets, drawn_job, drawn_views, grey_job
 from runtime.model.still import captured_views, solve_still
 from runtime.optics.rect import PixelRect
@@ -26,7 +26,7 @@ WINDOW = SolveWindow(PixelRect(100, 40, 300, 160), PixelRect(110, 50, 290, 150),
 class Model:
     """A model that keeps its jobs, and takes less and less time."""
 
-    stack, trims, reductions = STACK, True, (1, 2, 4)
+    stack, facts = STACK, ModelFacts("kept", "numpy", trims=True, reductions=(1, 2, 4))
 
     def __init__(self) -> None:
         self.jobs: list[Job] = []
@@ -71,7 +71,7 @@ def test_still_pictures_are_trimmed_if_that_is_asked_for(how: dict[str, Any], tr
     assert (job.eye_sigma_m, job.steps, job.window is not None) == (0.003, 5, trimmed)
     assert job.floats == ("floats" in how) and job.views[0].pixels.shape == (200, 400, 3)
     solve_still(picture, eyes_m=PAIR[:1], fov_deg=FOV_DEG, predictor=model, trimmed=True)  # type: ignore[arg-type]
-    model.trims = False
+    model.facts = replace(model.facts, trims=False)
     solve_still(picture, picture, eyes_m=PAIR, fov_deg=FOV_DEG, predictor=model, trimmed=True)  # type: ignore[arg-type]
     assert [job.window for job in model.jobs[1:]] == [None, None]
 

@@ -48,14 +48,14 @@ def displayed_db(solved_for: Any, seen_on: Any, *, model: str = "balanced", eyes
 def test_gaps_that_differ_a_little_are_served_by_the_network(share: float) -> None:
     uneven = replace(STACK, x_m=(-0.06 * (1 - share / 2), 0.0, 0.06 * (1 + share / 2)))
     predictor = load_predictor("balanced", uneven)
-    assert predictor.name == "balanced"
+    assert predictor.facts.name == "balanced"
     predictor.close()
     assert displayed_db(uneven, uneven) > displayed_db(STACK, STACK) - 1.0
 
 
 def test_uneven_gaps_are_served_without_the_network_and_named_so() -> None:
     predictor = load_predictor("balanced", replace(STACK, x_m=(-0.06, 0.0, 0.03)))
-    assert predictor.name.startswith("balanced (without its network")
+    assert predictor.facts.name.startswith("balanced (without its network")
 
 
 @pytest.mark.parametrize("x_m", [(-0.06, 0.0, 0.06), (-0.058, 0.001, 0.065)])

@@ -81,7 +81,7 @@ def test_any_even_spacing_is_served(gap_m: float) -> None:
 def test_other_stacks_are_served_from_even_panels_and_the_name_says_so(x_m: tuple[float, ...]) -> None:
     stack = PanelStack(0.5184, 0.2916, x_m, 240, 135)
     predictor = load_predictor("balanced", stack)
-    assert predictor.name.startswith("balanced (without its network")
+    assert predictor.facts.name.startswith("balanced (without its network")
     layers = solved("balanced", eyes(0.6), stack)
     assert layers.shape == (len(x_m), 135, 240, 4)
     assert displayed(layers, eyes(0.6), stack).psnr_db > 18

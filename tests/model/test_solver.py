@@ -218,16 +218,15 @@ def test_what_a_model_can_do_follows_from_its_proposal() -> None:
     fixed.any_raster = False
     facts = [
         (m.has_devices, m.trims, m.reductions, m.provider, m.parameters, m.precision)
-        for m in (model(Network(), device), model(fixed, device), model(None, device))
+        for m in (model(Network(), device).facts, model(fixed, device).facts, model(None, device).facts)
     ]
     assert facts == [
         (True, True, (1, 2, 3, 4), "cuda", 7, "fp16"),
         (False, False, (1,), "cuda", 7, "fp16"),
         (True, False, (1, 2, 3, 4), "cpu", 0, "fp32"),
     ]
-    assert [(m.steps, m.refined_steps) for m in (model(None, device), model(None, device, STEPS * 5))] == [
-        (2, 8), (10, 10),
-    ]  # fmt: skip
+    few, many = model(None, device).facts, model(None, device, STEPS * 5).facts
+    assert [(few.steps, few.refined_steps), (many.steps, many.refined_steps)] == [(2, 8), (10, 10)]
     model(fixed, device).solve(job())
     assert device.geometry.boxes == (PixelRect(0, 0, 320, 200),) * 3  # whole panels
 

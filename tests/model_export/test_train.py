@@ -255,7 +255,7 @@ def test_a_network_of_ones_own_is_trained_exported_and_served(tmp_path: Path) ->
     assert validate_file(path).passed
     pair = random_pair(np.random.default_rng([4, 1]), **SMALL)
     solved, predictor = solved_by(path, pair)
-    assert predictor.name == "MyNetwork"
+    assert predictor.facts.name == "MyNetwork"
     net = make_network(SHORT["arch"], SHORT["options"]).net.eval()
     net.load_state_dict(load_checkpoint(checkpoint)["model"])
     with torch.no_grad():
