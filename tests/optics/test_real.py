@@ -67,11 +67,12 @@ def intensity(values: tuple[float, float, float], real: RealPanels) -> F64:
 @pytest.mark.parametrize(("fov_deg", "sigma_mm"), [(4.0, 1.0), (4.0, 0.0), (16.0, 3.0)])  # at last beyond the panels
 def test_ideal_panels_give_the_solvers_own_figure(fov_deg: float, sigma_mm: float) -> None:
     layers, seen = smooth_layers(), replace(sight(sigma_mm), fov_deg=fov_deg, seen_from_m=EYES + 0.004)
-    ours = real_light(layers, STACK, RealPanels(), seen, RealSampling(rays=4)).light_db
+    rays = RealSampling(rays=4, pupil_mm=12.0)
+    ours = real_light(layers, STACK, RealPanels(), seen, rays).light_db
     at = {"eyes_m": EYES, "fov_deg": fov_deg, "sigmas_mm": (sigma_mm,), "seen_from_m": EYES + 0.004}
-    theirs = expected_psnrs_db(layers, seen.targets, STACK, sampling=Rays(rays=8), **at)[sigma_mm]
+    theirs = expected_psnrs_db(layers, seen.targets, STACK, sampling=Rays(rays=8, pupil_mm=12.0), **at)[sigma_mm]
     assert ours == pytest.approx(theirs, abs=0.01)
-    some = real_light(layers, STACK, RealPanels(), seen, RealSampling(rays=4, step=2, thinned=True)).light_db
+    some = real_light(layers, STACK, RealPanels(), seen, rays._replace(step=2, thinned=True)).light_db
     assert some == pytest.approx(theirs, abs=0.2)
 
 
