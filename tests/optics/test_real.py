@@ -27,6 +27,7 @@ from runtime.optics.real.cells import (
 from runtime.optics.real.light import RealSampling, Sight, real_light
 from runtime.optics.real.panels import Lighting, Optics, Placement, RealPanels, Timing
 from runtime.optics.real.trace import Tables, black_level, crossings, diffraction_orders, moments
+from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
 
@@ -65,15 +66,21 @@ def intensity(values: tuple[float, float, float], real: RealPanels) -> F64:
 
 
 @pytest.mark.parametrize(("fov_deg", "sigma_mm"), [(4.0, 1.0), (4.0, 0.0), (16.0, 3.0)])  # at last beyond the panels
-def test_ideal_panels_give_the_solvers_own_figure(fov_deg: float, sigma_mm: float) -> None:
-    layers, seen = smooth_layers(), replace(sight(sigma_mm), fov_deg=fov_deg, seen_from_m=EYES + 0.004)
-    rays = RealSampling(rays=4, pupil_mm=12.0)
-    ours = real_light(layers, STACK, RealPanels(), seen, rays).light_db
-    at = {"eyes_m": EYES, "fov_deg": fov_deg, "sigmas_mm": (sigma_mm,), "seen_from_m": EYES + 0.004}
-    theirs = expected_psnrs_db(layers, seen.targets, STACK, sampling=Rays(rays=8, pupil_mm=12.0), **at)[sigma_mm]
-    assert ours == pytest.approx(theirs, abs=0.01)
+@pytest.mark.parametrize(("pictures", "most_db"), [("noise", 0.01), ("seen", 0.1)])
+def test_ideal_panels_give_the_solvers_own_figure(
+    fov_deg: float, sigma_mm: float, pictures: str, most_db: float
+) -> None:
+    """Of noise, to a hundredth; of what pinhole eyes see, where every shift shows."""
+    layers, targets = smooth_layers(), sight().targets
+    if pictures == "seen":
+        size = {"fov_deg": fov_deg, "width_px": 68, "height_px": 44}
+        targets = tuple(seen_by(eye, layers, STACK, **size).image for eye in EYES)
+    seen, rays = Sight(EYES, targets, fov_deg, sigma_mm, EYES + 0.002), RealSampling(rays=4, pupil_mm=12.0)
+    at = {"eyes_m": EYES, "fov_deg": fov_deg, "sigmas_mm": (sigma_mm,), "seen_from_m": EYES + 0.002}
+    theirs = expected_psnrs_db(layers, targets, STACK, sampling=Rays(rays=8, pupil_mm=12.0), **at)[sigma_mm]
+    assert real_light(layers, STACK, RealPanels(), seen, rays).light_db == pytest.approx(theirs, abs=most_db)
     some = real_light(layers, STACK, RealPanels(), seen, rays._replace(step=2, thinned=True)).light_db
-    assert some == pytest.approx(theirs, abs=0.2)
+    assert some == pytest.approx(theirs, abs=0.3)
 
 
 def test_jones_calculus_and_summed_angles_agree() -> None:
