@@ -516,12 +516,12 @@ def test_contrast_and_gaps_decide_how_much_disparity_is_too_much() -> None:
         (0.06, 40, True),
     ):
         pictures, eyes, stack = example_at(gap_m, toed_px)
-        assert bool(disparity_doubts(pictures, eyes, stack, fov_deg=40)) == ghosts, (gap_m, toed_px)
+        assert bool(disparity_doubts(pictures, eyes, stack, fov_deg=40, parallel=True)) == ghosts, (gap_m, toed_px)
     eyes = np.array([(0.6, -0.0315, 0.0), (0.6, 0.0315, 0.0)])
     gaps = phasestack.Stack(0.5184, 0.2916, (-0.03, 0.0, 0.03), 320, 180)
     for levels, ghosts, least_db, most_db in (((90, 115, 145, 170), False, 32, 40), ((30, 90, 160, 230), True, 10, 25)):
         pictures = rectified(24, levels)
-        assert bool(disparity_doubts(pictures, eyes, gaps, fov_deg=40)) == ghosts
+        assert bool(disparity_doubts(pictures, eyes, gaps, fov_deg=40, parallel=True)) == ghosts
         light_db = phasestack.solve(*pictures, eyes_m=eyes, stack=gaps).measure(sigmas_mm=(1,), every=2).light_db["1"]
         assert least_db < light_db < most_db, levels
 

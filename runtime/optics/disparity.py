@@ -122,7 +122,7 @@ def _is_ambiguous(left: U8, right: U8, matched: F64) -> NDArray[np.bool_]:
 
 
 def disparity_doubts(
-    pictures: Sequence[U8 | F32], eyes_m: Eyes, stack: PanelStack, *, fov_deg: float, parallel: bool = True
+    pictures: Sequence[U8 | F32], eyes_m: Eyes, stack: PanelStack, *, fov_deg: float, parallel: bool
 ) -> list[str]:
     """Return a one-line warning, in a list, if the pictures will cause ghosts, or an empty list.
     `parallel`: they may be a rectified pair from parallel cameras, passed by mistake; the warning says so if it seems

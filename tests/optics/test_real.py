@@ -404,13 +404,13 @@ def test_a_panel_lags_by_delay_and_response_less_what_is_allowed(
 
 def test_a_late_panel_shows_its_picture_displaced_while_the_head_moves() -> None:
     """The front panel's picture of columns moves by 5 pixels per refresh; it is late by one."""
-    stack = PanelStack(0.12, 0.09, (-0.03, -0.01, 0.01, 0.03), 160, 120)
+    stack = PanelStack(0.12, 0.09, (-0.02, 0.0, 0.02, 0.04), 160, 120)
     layers = np.zeros((4, 120, 160, 3), np.uint8)
     layers[3] = np.arange(160)[None, :, None]
-    crossed = crossings(MIDDLE, np.array([[-0.01, 0.0153, 0.0]]), stack, RealPanels(), random())
-    assert crossed.u[3] == pytest.approx([99.062], abs=1e-3)
+    crossed = crossings(MIDDLE, np.array([[0.0, 0.0153, 0.0]]), stack, RealPanels(), random())
+    assert crossed.u[3] == pytest.approx([99.04])
     for late_ms, columns in (((0, 0, 0, 10.0), (102, 103, 104, 105)), ((10.0, 0, 0, 0), (97, 98, 99, 100))):
-        real = RealPanels(timing=Timing(rate_hz=100.0, head_m_s=7.5, late_ms=late_ms))
+        real = RealPanels(timing=Timing(rate_hz=100.0, head_m_s=7.375, late_ms=late_ms))
         light = Tables(layers, stack, real).light(crossed, 0.6)[0][0, 0]
         assert light == pytest.approx(np.mean([math.sin(math.pi / 2 * column / 255) ** 2 for column in columns]))
 

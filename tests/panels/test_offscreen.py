@@ -21,7 +21,7 @@ from runtime.optics.presentation import shown_layers
 from runtime.optics.stack import PanelStack
 from runtime.panels.presentation import mount_of
 from runtime.panels.processor import Mounting, ProcessorPainter
-from runtime.records import U8, PanelFrame
+from runtime.records import U8, PanelFrame, PresentReport
 from tests.panels.drawn import DrawnPanels, ProcessorDrawnPanels, ReadPanels
 
 WIDTH, HEIGHT = 48, 32
@@ -156,7 +156,7 @@ def codes(pictures: NDArray[np.uint8] | tuple[NDArray[np.uint8], NDArray[np.uint
 @BOTH
 def test_an_unaligned_panel_is_exact_to_the_bit_beside_aligned_ones(sink: ReadPanels) -> None:
     frame = PanelFrame(1, smooth(1), 1, align(STACK, solved_for_m=HEAD, eyes_m=HEAD * 1.01).solved_from_shown)
-    sink.present(frame)
+    assert sink.present(frame) == PresentReport(1, 0, 0.0)
     assert np.array_equal(codes(sink.read_back())[1], codes(frame.solved)[1])
     assert not np.array_equal(codes(sink.read_back())[0], codes(frame.solved)[0])
 

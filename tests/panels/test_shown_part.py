@@ -97,10 +97,14 @@ def test_after_a_blend_with_the_flat_picture_everything_is_drawn_once(mounted: s
 
 
 def test_nothing_is_drawn_where_layers_rest() -> None:
-    kept, _ = painter(PanelSettings())
+    kept, screens = painter(PanelSettings())
     layers = np.full((3, HEIGHT, WIDTH, 4), rest_code(3), np.uint8)
     kept.draw(frame(2, layers, HEAD))
     assert kept.draw(frame(4, layers, HEAD + 0.01)) == {}
+    for screen in screens:
+        screen[:, :8] = 7
+    kept.draw(frame(6, sparse_layers(PixelRect(96, 64, 320, 240), 1, coarser=1), HEAD + 0.01))
+    assert all((screen[:, :8] == 7).all() and screen.std() > 20 for screen in screens)
 
 
 def test_layers_without_a_resting_border_are_drawn_whole() -> None:
