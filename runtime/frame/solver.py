@@ -100,14 +100,11 @@ class Solver:
             return self._draw_flat(revision=revision, time_ns=time_ns)
         if job.eyes_m is not None:
             wanted = request.refined_to if job.kind == "refine" else request.effort
-            offered, steps = (
-                state.predictor.facts.reductions,
-                state.predictor.facts.steps,
-            )  # may be those of a new model
-            if wanted is None or wanted.reduction not in offered:
-                wanted = Effort(1, steps)
+            facts = state.predictor.facts  # may be those of a new model
+            if wanted is None or wanted.reduction not in facts.reductions:
+                wanted = Effort(1, facts.steps)
             elif job.kind == "solve":
-                wanted = replace(wanted, steps=min(wanted.steps, steps))
+                wanted = replace(wanted, steps=min(wanted.steps, facts.steps))
             return self._solve(request, job.eyes_m, wanted, revision=revision)
         if request.eyes_m is not None and not request.paused:
             self._missing = {}  # the latest solution already fulfils the request
