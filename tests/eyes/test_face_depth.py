@@ -24,6 +24,7 @@ def test_eyes_are_found_in_space_to_some_millimetres_at_every_place() -> None:
         for number in (1, 2, 3):
             found = finder.find(frame(colour, depth, CAMERA, number=number))
         assert found is not None and np.abs(found.eyes_m - truth).max() < 0.005
+        assert found.confidence.shape == (2,) and 0.9 < found.confidence.min() <= found.confidence.max() <= 1.0
         assert found.eyes_m[0, 0] > found.eyes_m[1, 0]  # the left one is on the right of an unmirrored picture
 
 
