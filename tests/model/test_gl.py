@@ -217,6 +217,8 @@ def test_a_panel_wider_than_the_driver_allows_is_refused(gl: GlBackend) -> None:
         InputError, match=rf"stack: width_px: is {widest + 8}, but this OpenGL driver allows at most {widest}"
     ):
         choose("gl", predictor.bound(stack=stack), lambda: gl.passes.context)
+    with pytest.raises(InputError, match=r"height_px: is \d+, but"):
+        gl.state(replace(STACK, height_px=widest + 8), threads=1)
 
 
 def test_only_pictures_the_networks_answer_and_layers_cross(gl: GlBackend, monkeypatch: pytest.MonkeyPatch) -> None:
