@@ -262,6 +262,8 @@ def test_columns_are_even_if_the_eyes_line_meets_the_raster_or_hardly_its_plane(
     pair = np.array([[0.6 + nearer_m, -0.03, 0.0], [0.6 - nearer_m, 0.03, 0.0]])
     frame = chain_frame(pair, STACK, most_cell_px=4, reduction=2)
     assert bool(frame.columns.bend) == bent == (frame.rows != 136)
+    # At one end, rows lie as much farther apart as columns do, which are spaced by a logarithm.
+    assert frame.stretch == pytest.approx(np.exp(abs(frame.columns.bend) * frame.width_px / 2))
     at = np.array([frame.width_px / 2, frame.rows / 2, 1.0])
     for x_m, sign in ((STACK.x_m[0], 1), (STACK.x_m[2], -1)):
         there = [frame.frame_from_plane(x_m=x_m) @ frame.plane_from_frame(eye, x_m=x_m) @ at for eye in pair]
