@@ -60,14 +60,14 @@ def test_boxes_of_small_panels_are_whole() -> None:
 @pytest.mark.parametrize(
     ("first", "last", "over_px", "weights"),
     [
-        (10, 30, 4.0, [0.0, 0.0, 0.25, 0.5, 1.0, 1.0, 0.25, 0.0]),
-        (0, 30, 4.0, [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.25, 0.0]),  # the panel's edge
-        (10, 40, 4.0, [0.0, 0.0, 0.25, 0.5, 1.0, 1.0, 1.0, 1.0]),
-        (10, 30, 0.0, [1.0] * 8),
+        (10, 30, 4.0, [0.0, 0.0, 0.25, 0.5, 1.0, 1.0, 0.25, 0.0, 0.0]),
+        (0, 30, 4.0, [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.25, 0.0, 0.0]),  # the panel's edge
+        (10, 40, 4.0, [0.0, 0.0, 0.25, 0.5, 1.0, 1.0, 1.0, 1.0, 1.0]),
+        (10, 30, 0.0, [1.0] * 9),
     ],
 )
 def test_weights_rise_from_a_window_s_edges(first: int, last: int, over_px: float, weights: list[float]) -> None:
-    at_px = np.array([0.0, 10.0, 11.0, 12.0, 14.0, 26.0, 29.0, 30.0])
+    at_px = np.array([0.0, 10.0, 11.0, 12.0, 14.0, 26.0, 29.0, 30.0, 39.0])
     assert taper(at_px, first, last, 40, over_px) == pytest.approx(np.array(weights))
 
 
