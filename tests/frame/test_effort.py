@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from itertools import groupby, pairwise
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -165,26 +162,6 @@ def test_on_a_fast_machine_a_moving_head_gets_the_full_raster() -> None:
 def test_what_is_shown_badly_is_answered_quickly() -> None:
     costs = simulated_costs(STAGE_MS, REDUCTIONS)
     assert costs.ms(chosen(0.0, shown_error=0.05)) < costs.ms(chosen(0.0, shown_error=1e-3))
-
-
-def test_between_nearly_equal_efforts_the_faster_one_is_kept() -> None:
-    """Noise in the head's speed about the point where two efforts are equal does not show as flicker."""
-    costs, chooser, picked = simulated_costs(STAGE_MS, REDUCTIONS), EffortChooser(), list[Effort]()
-    changes = sorted({speed: chosen(speed) for speed in [k / 500 for k in range(500)]}.items())
-    border = next(b[0] for a, b in pairwise(changes) if a[1] != b[1])
-    for k in range(50):
-        speed = border * (1.0 + 0.02 * math.sin(k))
-        picked.append(
-            chooser.choose(
-                candidates(REDUCTIONS, 4),
-                costs,
-                lambda cost_ms, speed=speed: Outlook(5e-4, speed, max(cost_ms / 1e3 - 0.1, 0.0) * speed),
-                shown_error=5e-3,
-                period_ms=PERIOD_MS,
-            )
-        )
-    taken_ms = [costs.ms(effort) for effort, _ in groupby(picked)]
-    assert len(taken_ms) <= 2 and taken_ms == sorted(taken_ms, reverse=True)
 
 
 def test_rates_of_change_are_learned_from_successive_pictures() -> None:

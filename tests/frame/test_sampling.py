@@ -236,7 +236,7 @@ def test_the_last_refresh_counts_if_no_other_was_measured(
     of: Callable[..., Sampled], before: bool, state: State, figures: int, live: int
 ) -> None:
     sampled = of(simulated=True)
-    sampled.draws_from_s = 0.0
+    sampled.draws_from_s = 0.0  # at once
     if before:
         sampled.shows(0)
     sampled.sampler.finish(refresh(7, solution(1), state=state))
