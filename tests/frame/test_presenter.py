@@ -379,11 +379,11 @@ def test_no_refresh_waits_for_the_solver() -> None:
 
 
 def test_a_solution_ran_at_its_first_refresh_and_is_reused_later(stage: Stage) -> None:
-    stage.solver.hand_over(solved=solution(3, stage_ms={"render": 8.0, "inference": 3.0}))
+    stage.solver.hand_over(solved=solution(3, stage_ms={"render": 8.0, "inference": 3.0, "step": 5.0}))
     told = [done.account for done in stage.refresh(3)]
     assert [account.inference for account in told] == ["ran", "reused", "reused"]
     assert {name: told[0].stage_ms[name] for name in ("render", "prepare", "inference", "finish")} == {
-        "render": 8.0, "prepare": 0.0, "inference": 3.0, "finish": 0.0,
+        "render": 8.0, "prepare": 0.0, "inference": 3.0, "finish": 5.0,
     }  # fmt: skip
     assert set(told[1].stage_ms) == {"wait", "sensor", "track", "present"}
 

@@ -85,9 +85,9 @@ def test_the_same_people_are_compared_wherever_they_are_listed(
 
 
 def test_an_eye_that_sees_nothing_is_replaced_by_its_person_s_other() -> None:
-    one_eyed = replace(solution((1, 2), TWO), seeing=(True, True, False, True))
-    np.testing.assert_array_equal(matched(one_eyed, estimate((2,), TWO[2:]))[1], TWO[[3, 3]])
-    np.testing.assert_array_equal(matched(one_eyed, estimate((1, 2), TWO))[1], TWO[[0, 1, 3, 3]])
+    one_eyed = replace(solution((1, 2), TWO), seeing=(True, True, True, False))
+    np.testing.assert_array_equal(matched(one_eyed, estimate((2,), TWO[2:]))[1], TWO[[2, 2]])
+    np.testing.assert_array_equal(matched(one_eyed, estimate((1, 2), TWO))[1], TWO[[0, 1, 2, 2]])
 
 
 @pytest.mark.parametrize(

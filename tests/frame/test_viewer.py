@@ -130,6 +130,12 @@ def test_a_calibration_of_another_sensor_is_warned_of_once(caplog: pytest.LogCap
         assert caplog.text.count("A-1") == (serial != "")
 
 
+def test_two_viewers_of_three_panels_are_warned_of(caplog: pytest.LogCaptureFixture) -> None:
+    for viewers, warnings in ((1, 0), (2, 1)):
+        viewer(tracker={"viewers": viewers})
+        assert caplog.text.count("tracker.viewers: while 3 panels serve two people") == warnings
+
+
 def test_looking_ahead_for_the_solver_changes_nothing_of_what_is_shown() -> None:
     """Eyes return after a loss: they fade from where they were *shown* last, however far ahead the solver asked."""
     story: dict[str, Any] = {
