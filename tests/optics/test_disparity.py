@@ -98,14 +98,28 @@ def test_only_eyes_side_by_side_are_compared(line: tuple[float, float, float], i
     assert bool(doubts(pair_at(0.1, eyes_m=eyes_m), eyes_m=eyes_m)) == is_compared
 
 
-@pytest.mark.parametrize(("rows", "ghosts"), [(0, False), (14, False), (27, True)])
-def test_a_small_part_outside_the_stack_is_not_reported(rows: int, ghosts: bool) -> None:
-    pictures = [np.concatenate([a[:rows], b[rows:]]) for a, b in zip(pair_at(0.2), pair_at(0.0), strict=True)]
-    assert bool(doubts(pictures)) == ghosts
-
-
-def test_pictures_of_different_scenes_have_no_disparity() -> None:
-    assert doubts([blocks_at(0.1, eye_m, seed=seed) for seed, eye_m in enumerate(EYES)]) == []
+@pytest.mark.parametrize(
+    ("beside", "rows", "ghosts"),
+    [
+        ("the middle panel", 0, False),
+        ("the middle panel", 14, False),  # of 180
+        ("the middle panel", 27, True),
+        ("different scenes", 0, False),
+        ("different scenes", 25, False),
+        ("different scenes", 45, True),
+        ("an even area", 40, False),
+        ("an even area", 60, True),
+    ],
+)
+def test_rows_outside_the_stack_are_reported_if_enough_match(beside: str, rows: int, ghosts: bool) -> None:
+    rest = {
+        "the middle panel": pair_at(0.0),
+        "different scenes": [blocks_at(0.1, eye_m, seed=seed) for seed, eye_m in enumerate(EYES)],
+        "an even area": [np.full((180, 320, 3), 90, np.uint8)] * 2,
+    }[beside]
+    assert (
+        bool(doubts([np.concatenate([a[:rows], b[rows:]]) for a, b in zip(pair_at(0.2), rest, strict=True)])) == ghosts
+    )
 
 
 @pytest.mark.parametrize("period_px", [8, 12, 24])
