@@ -77,6 +77,8 @@ def test_rays_fade_over_a_sixth_of_the_window_s_taper() -> None:
     assert across[[0, 4, 9, 10, -11, -1]] == pytest.approx([0.05, 0.45, 0.95, 1.0, 1.0, 0.05])
     assert down[[0, 91, 92, -1]] == pytest.approx([1.0, 1.0, 0.875, 0.125])
     assert [(weights == 1.0).all() for weights in geometry(box, kept=kept).tapers()] == [True, True]
+    _, down = geometry(PixelRect(40, 20, 200, 120), kept=PixelRect(60, 30, 180, 110), taper_px=(60.0, 24.0)).tapers()
+    assert down[[0, 3, 4, -5, -1]] == pytest.approx([0.125, 0.875, 1.0, 1.0, 0.125])
     # Pixel (u, v) of a leaning picture is at (u, v) / (1 + (u + v) / 1000).
     lean = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.001, 0.001, 1.0]])
     leaning = TargetView(PICTURE, STACK.panel(1).plane_from_raster() @ lean)
