@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from itertools import groupby, pairwise
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -164,6 +167,26 @@ def test_what_is_shown_badly_is_answered_quickly() -> None:
     assert costs.ms(chosen(0.0, shown_error=0.05)) < costs.ms(chosen(0.0, shown_error=1e-3))
 
 
+def test_between_nearly_equal_efforts_the_faster_one_is_kept() -> None:
+    """Noise in the head's speed about the point where two efforts are equal does not show as flicker."""
+    costs, chooser, picked = simulated_costs(STAGE_MS, REDUCTIONS), EffortChooser(), list[Effort]()
+    changes = sorted({speed: chosen(speed) for speed in [k / 500 for k in range(500)]}.items())
+    border = next(b[0] for a, b in pairwise(changes) if a[1] != b[1])
+    for k in range(50):
+        speed = border * (1.0 + 0.02 * math.sin(k))
+        picked.append(
+            chooser.choose(
+                candidates(REDUCTIONS, 4),
+                costs,
+                lambda cost_ms, speed=speed: Outlook(5e-4, speed, max(cost_ms / 1e3 - 0.1, 0.0) * speed),
+                shown_error=5e-3,
+                period_ms=PERIOD_MS,
+            )
+        )
+    taken_ms = [costs.ms(effort) for effort, _ in groupby(picked)]
+    assert len(taken_ms) <= 2 and taken_ms == sorted(taken_ms, reverse=True)
+
+
 def test_rates_of_change_are_learned_from_successive_pictures() -> None:
     pictures = PictureStatistics(contrast=0.03)
     for k in range(200):
@@ -315,6 +338,27 @@ def test_times_of_a_raster_unused_for_a_hundred_solutions_are_forgotten() -> Non
         book.learn(Effort(2, 0), {"render": 25.0})
     book.learn(Effort(2, 0), {"render": 25.0})
     assert book.costs().ms(Effort(3, 0)) == pytest.approx(100.0 / 9)
+
+
+def test_other_work_changes_the_times_of_all_rasters() -> None:
+    """Otherwise a raster measured while the machine was busy would be avoided long after."""
+    book = CostBook({by: {"render": 100.0 / by**2, "step": 10.0 / by**2} for by in REDUCTIONS})
+    for _ in range(40):
+        book.learn(Effort(2, 1), {"render": 25.0, "step": 2.5})
+    for load in (*[3.0] * 20, *[1.0] * 40):
+        book.learn(Effort(4, 0), {"render": 6.25 * load})
+        assert book.costs().ms(Effort(2, 0)) == pytest.approx(4 * book.costs().ms(Effort(4, 0)), rel=0.25)
+    assert book.costs().ms(Effort(2, 1)) == pytest.approx(27.5, rel=0.01)
+    assert book.costs().ms(Effort(4, 1)) == pytest.approx(27.5 / 4, rel=0.01)
+
+
+def test_the_ratio_between_rasters_is_learned_by_using_both() -> None:
+    book = CostBook({by: {"render": 100.0 / by**2} for by in REDUCTIONS})
+    for _ in range(60):  # drawing the scene takes as long on every raster
+        for reduction in (2, 4):
+            book.learn(Effort(reduction, 0), {"render": 25.0})
+    costs = book.costs()
+    assert costs.ms(Effort(2, 0)) == pytest.approx(costs.ms(Effort(4, 0)), rel=0.15)
 
 
 def test_a_continued_solution_teaches_nothing_of_drawing() -> None:

@@ -18,6 +18,7 @@ from runtime.config import Settings
 from runtime.content.base import ContentInfo, ContentSource, View
 from runtime.evaluation.displayed import displayed
 from runtime.evaluation.refresh_quality import RefreshTargets
+from runtime.frame import sampling
 from runtime.frame.measuring import Comparison, MeasuringProcess
 from runtime.frame.messages import Draw, Facts, Order
 from runtime.frame.observer import RunObserver
@@ -187,7 +188,8 @@ def test_of_2048_lines_that_wait_the_oldest_is_written(content: ContentSource) -
         observer.refreshed(refresh(number, None))
     assert kept.lines == []
     observer.refreshed(refresh(2048, None))
-    assert [line["frame"] for line in kept.lines] == [1] and kept.lines[0]["true_eyes_m"] is None
+    observer.refreshed(refresh(2049, None))
+    assert [(line["frame"], line["true_eyes_m"]) for line in kept.lines] == [(1, None), (2, None)]
 
 
 def test_view_errors_are_each_person_s_or_the_one_s_served_last(solved: Solution) -> None:
@@ -285,6 +287,21 @@ def test_every_so_many_refreshes_are_sampled_while_tracking_and_no_others(
     assert observer.summary()["quality_frames"] == 3
 
 
+@pytest.mark.parametrize("change", [{"presented": False}, {"eyes_m": None}, {"flatness": 0.5}])
+def test_unseen_pictures_and_mixtures_with_the_flat_one_are_not_measured(
+    content: ContentSource, solved: Solution, change: dict[str, Any]
+) -> None:
+    observer, _ = looking(content, evaluate_every=1)
+    seen = refresh(1, solved)
+    if "flatness" in change:
+        seen = replace(seen, frame=replace(seen.frame, flat=solved.layers, flat_version=2, **change))
+    else:
+        seen = replace(seen, account=replace(seen.account, **change))
+    observer.refreshed(seen)
+    observer.finish()
+    assert observer.summary()["psnr_db"] is None
+
+
 def test_a_short_run_measures_its_last_refresh(content: ContentSource, solved: Solution) -> None:
     observer, _ = looking(content, evaluate_every=50)
     observer.refreshed(refresh(1, solved))
@@ -338,6 +355,34 @@ def test_in_real_time_one_measurement_runs_at_a_time_and_delays_nothing(
     assert wait_for_all(120.0) == 0
     observer.refreshed(refresh(10, solved))
     assert observer.summary()["quality_frames"] == 1
+
+
+@pytest.mark.parametrize(("share", "begun"), [(1.0, True), (1e-9, False)])
+def test_measuring_takes_only_its_share_of_a_real_time_run(
+    share: float, begun: bool, content: ContentSource, solved: Solution, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sampling, "MEASURING_SHARE", share)
+    solver = Drawing(content, at_once=False)
+    observer, _ = looking(content, solver=solver, simulated=False, evaluate_every=1)
+    observer.refreshed(refresh(0, solved))
+    solver.draw()
+    assert wait_for_all(120.0) == 0
+    observer.refreshed(refresh(1, solved))
+    assert len(solver.orders) == begun
+
+
+def test_a_few_samples_that_came_meanwhile_are_measured_at_the_end(content: ContentSource, solved: Solution) -> None:
+    solver = Drawing(content, at_once=False)
+    observer, _ = looking(content, solver=solver, simulated=False, evaluate_every=1)
+    for number in range(2 * sampling.HELD_MAX):
+        observer.sampled(sample(NS_PER_S + number * PERIOD_NS))
+        observer.refreshed(refresh(number, solved))
+    solver.draw()  # the first one's
+    solver.at_once = True
+    observer.finish()
+    last = 2 * sampling.HELD_MAX - 1
+    assert set(observer.live_errors) > {0, last} and len(observer.live_errors) == 1 + sampling.HELD_MAX
+    assert observer.moment is not None and observer.moment.lines[0].startswith(f"Refresh {last}:")
 
 
 def test_another_process_finds_the_same_figures_and_its_end_costs_one(content: ContentSource, solved: Solution) -> None:
@@ -505,6 +550,27 @@ def live(content: ContentSource) -> Live:
     return Live(content)
 
 
+def test_a_live_figure_applies_to_these_eyes_and_this_state_alone(live: Live, solved: Solution) -> None:
+    there: dict[str, Any] = {"eyes_m": aside(0.02)}
+    live.measured(solved)
+    assert live.db(solved, **there) is None, "the figure of another position"
+    live.measured(solved, **there)
+    stale = live.light(solved, **there, state_version=1)
+    assert stale["light_db"] is None, "the scene or the model has changed, and the panels still show the old solution"
+    assert stale["light_age_s"] is None
+    live.measured(replace(solved, number=2, state_version=1), **there, state_version=1)
+    assert live.db(solved, **there) is None
+
+
+def test_a_live_figure_applies_until_either_of_two_people_moves(live: Live, solved: Solution) -> None:
+    def people(*places: Any) -> dict[str, Any]:
+        return {"people": tuple(PersonAccount(number, eyes_m, eyes_m) for number, eyes_m in enumerate(places, start=1))}
+
+    live.measured(solved, **people(EYES, aside(0.2)))
+    assert live.db(solved, **people(EYES, aside(0.22))) is None
+    assert live.db(solved, **people(EYES)) is None
+
+
 def test_a_live_figure_falls_where_depth_is_seen_from_elsewhere(live: Live, solved: Solution) -> None:
     assert live.measured(solved) - live.measured(solved, eyes_m=aside(0.15)) > 5
 
@@ -516,6 +582,17 @@ def test_a_live_figure_has_an_age_and_follows_a_better_solution(live: Live, solv
     age_s = (later.account.frame - first) * PERIOD_NS / NS_PER_S
     assert live.observer.light(later)["light_age_s"] == pytest.approx(age_s, abs=0.06)
     assert eventually(lambda: live.light(replace(solved, number=2))["measured_frame"] != first)
+
+
+@pytest.mark.parametrize(("settled_s", "has_figure"), [(0.0, False), (600.0, True)])
+def test_a_refined_solution_that_stays_on_the_panels_has_no_old_figure(
+    live: Live, solved: Solution, monkeypatch: pytest.MonkeyPatch, settled_s: float, has_figure: bool
+) -> None:
+    monkeypatch.setattr(sampling, "SETTLED_S", settled_s)
+    live.measured(solved)
+    refined = replace(solved, number=2)
+    assert (live.db(refined) is not None) == has_figure
+    live.measured(refined)
 
 
 # --- kept light --------------------------------------------------------------------------------------------------
@@ -556,22 +633,23 @@ def test_a_live_sensor_s_pictures_are_drawn_during_the_run(content: ContentSourc
     assert kept.lights[1]["info"]["true_eyes_m"] is None
 
 
+@pytest.mark.parametrize("count_drawn", [0, 1])
 def test_who_stops_a_run_waits_for_no_kept_picture(
-    content: ContentSource, solved: Solution, caplog: pytest.LogCaptureFixture
+    content: ContentSource, solved: Solution, caplog: pytest.LogCaptureFixture, count_drawn: int
 ) -> None:
-    solver = Drawing(content)
+    solver = Drawing(content, at_once=count_drawn > 0)
     observer, kept = looking(content, solver=solver, keep_light=1)
     for number in range(3):
         observer.sampled(sample(NS_PER_S + number * PERIOD_NS))
         observer.refreshed(refresh(number, solved))
 
     def stopped() -> bool:
-        """Once the first is drawn, and the solver is busy with the second."""
-        solver.at_once = "drawn" not in kept.lights[0]
-        return bool(solver.orders)
+        """At once, or when the first is drawn and the solver is busy with the second."""
+        solver.at_once = count_drawn > 0 and "drawn" not in kept.lights[0]
+        return count_drawn == 0 or bool(solver.orders)
 
     observer.finish(stopped)
-    assert "2 of 3 refreshes kept by --keep-light have no" in caplog.text
+    assert f"{3 - count_drawn} of 3 refreshes kept by --keep-light have no" in caplog.text
     assert all({"layers", "info"} <= light.keys() for light in kept.lights.values())
-    assert [light["drawn"] is not None for light in kept.lights.values()] == [True, False, False]
+    assert [light.get("drawn") is not None for light in kept.lights.values()] == [n < count_drawn for n in range(3)]
     assert kept.lights[2]["info"]["true_eyes_m"] is not None

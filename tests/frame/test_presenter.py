@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
@@ -11,7 +12,9 @@ import numpy as np
 import pytest
 
 from runtime.clock import NS_PER_MS, NS_PER_S, MonotonicClock
+from runtime.frame.aim import HORIZON_NS
 from runtime.optics.alignment import align
+from runtime.plan.savings import selected_eyes
 from runtime.records import State
 from tests.frame import fakes
 from tests.frame.fakes import EYES, HZ, PERIOD_NS, STACK, Stage, aside, picture, solution
@@ -375,6 +378,31 @@ def test_no_refresh_waits_for_the_solver() -> None:
     assert ages == pytest.approx(PERIOD_NS / NS_PER_MS, abs=0.01)  # and it says how old the solution is
 
 
+# --- requests to the solver ------------------------------------------------------------------------------------
+
+
+def test_eyes_are_requested_for_the_middle_of_the_solution_s_showing(
+    stage: Stage,
+) -> None:
+    stage.eyes = moves
+    for cost_ms in (1, 20, 60):
+        stage.solver.solve_cost_ns = cost_ms * NS_PER_MS
+        (done,) = stage.refresh()
+        request = stage.solver.requests[-1]
+        first = max(1, -(-stage.solver.solve_cost_ns // PERIOD_NS))
+        last = max(first, -(-2 * stage.solver.solve_cost_ns // PERIOD_NS) - 1)
+        assert request.time_ns == pytest.approx(
+            done.account.predicted_for_ns + (first + last) * PERIOD_NS / 2, abs=PERIOD_NS / 100
+        )
+        reached_ns = min(request.time_ns, done.account.predicted_for_ns + HORIZON_NS)
+        ahead_m = stage.viewer.ahead(reached_ns).eyes_m
+        # Not all of the way where the tracker does not know it.
+        way, gone = ((eyes_m - done.account.eyes_m).mean(axis=0) for eyes_m in (ahead_m, request.eyes_m))
+        assert 0.0 <= float(gone @ way) <= float(way @ way) * 1.0001
+        np.testing.assert_allclose(np.cross(gone, way), 0.0, atol=1e-12)
+        assert request.sigma_m * 1000 == pytest.approx(done.account.eye_sigma_mm)
+
+
 # --- accounts ----------------------------------------------------------------------------------------------------
 
 
@@ -446,6 +474,17 @@ def test_panels_that_take_longer_than_a_period_are_told_by_the_presenter() -> No
     assert abs(told_now - now) <= 2
 
 
+def test_a_model_whose_rasters_are_not_timed_yet_stops_no_refresh(stage: Stage) -> None:
+    """A model is replaced on the solver's thread; the presenter may see it before its costs are known."""
+    stage.solver.offered = (1, 2, 3, 4)
+    stage.eyes = moves
+    stage.refresh(30)
+    assert {request.effort.reduction for request in stage.solver.requests[-30:]} == {1}
+    stage.solver.reductions, stage.solver.solve_cost_ns = (1, 2, 3, 4), 300 * NS_PER_MS
+    stage.refresh(30)
+    assert stage.solver.requests[-1].effort.reduction > 1
+
+
 def test_a_solver_that_has_not_started_yet_stops_no_refresh(stage: Stage) -> None:
     stage.solver.reductions = ()
     stage.eyes = moves
@@ -462,6 +501,57 @@ def test_a_display_of_a_few_hertz_stops_no_refresh(monkeypatch: pytest.MonkeyPat
     stage.eyes = moves
     stage.refresh(20)
     assert stage.solver.requests[-1].eyes_m is not None
+
+
+def test_a_calm_head_gets_longer_solutions_within_a_second() -> None:
+    """The longer a head has been calm, the less it matters that panels cannot answer while a solution is computed."""
+    stage = Stage()
+    stage.solver.offered = stage.solver.reductions = (1, 2, 3, 4)
+    stage.solver.solve_cost_ns = 600 * NS_PER_MS
+    stage.eyes = lambda time_s: aside(0.002 * np.sin(2 * time_s))
+    stage.refresh(HZ)
+    asked = [request.effort.reduction for request in stage.solver.requests]
+    assert asked[HZ // 3] > 2
+    assert asked[-1] == 2
+
+
+def test_a_head_that_has_rested_counts_as_one_that_never_moved() -> None:
+    """The speed before the rest says nothing about a head that stirs after it."""
+
+    def asked(before: Callable[[float], Any]) -> list[int]:
+        stage = Stage(plan={"enabled": True})
+        stage.solver.offered = stage.solver.reductions = (1, 2, 3, 4)
+        stage.solver.solve_cost_ns = 150 * NS_PER_MS
+        stage.eyes = lambda time_s: before(time_s) if time_s < 2.0 else aside(0.01 * max(time_s - 6.0, 0.0))
+        stage.refresh(6 * HZ)
+        assert stage.solver.requests[-1].eyes_label == "rested"
+        stage.refresh(HZ)
+        requests = stage.solver.requests[-HZ:]
+        assert requests[-1].eyes_label == "predicted"
+        return [request.effort.reduction for request in requests]
+
+    assert asked(lambda time_s: aside(0.5 * np.sin(4 * time_s))) == asked(lambda time_s: EYES)
+
+
+def test_a_viewer_of_whom_one_eye_sees_gets_no_coarser_solutions() -> None:
+    """The solution is for the left eye alone, whose place is not that of the midpoint."""
+    beside_m = np.array([[0.123, 0.43, 0.0], [0.078, 0.47, 0.0]])
+
+    def asked(seeing: tuple[bool, bool]) -> list[int]:
+        stage = Stage()
+        stage.solver.offered = stage.solver.reductions = (1, 2, 3, 4)
+        stage.solver.solve_cost_ns = 150 * NS_PER_MS
+        stage.eyes = lambda _: beside_m
+        for number in range(HZ):
+            stage.refresh()
+            request = stage.solver.requests[-1]
+            if request.eyes_m is not None:
+                eyes_m = selected_eyes(request.eyes_m, seeing)
+                made = solution(number + 2, eyes_m, time_ns=request.time_ns, effort=request.effort, seeing=seeing)
+                stage.solver.hand_over(solved=made)
+        return [request.effort.reduction for request in stage.solver.requests[HZ // 2 :]]
+
+    assert asked((True, False)) == asked((True, True))
 
 
 def test_a_moving_head_about_to_be_given_up_gets_no_long_solution(stage: Stage) -> None:

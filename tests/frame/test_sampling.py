@@ -141,17 +141,6 @@ def test_a_live_figure_is_measured_again_once_out_of_date(of: Callable[..., Samp
     assert ordered(70.0, **there, solution=2) == 0 and has_figure()
 
 
-def test_a_figure_of_an_earlier_solution_ends_once_another_has_settled(of: Callable[..., Sampled]) -> None:
-    sampled = of(newest=True)
-    for at_s in (0.0, 0.4):
-        sampled.shows(round(10 * at_s), at_s=at_s)
-    sampled.drawn()
-    sampled.shows(5, at_s=0.5)
-    for at_s, has_figure in ((0.6, True), (1.5, True), (1.7, False)):
-        sampled.shows(round(10 * at_s), at_s=at_s, of=2)
-        assert (sampled.sampler.figure_of(sampled.shown) is not None) == has_figure
-
-
 @pytest.mark.parametrize(("most", "others"), [(9, 4), (3, 2)])
 def test_of_refreshes_due_meanwhile_the_newest_and_a_few_others_are_measured(
     of: Callable[..., Sampled], monkeypatch: pytest.MonkeyPatch, most: int, others: int
@@ -253,9 +242,7 @@ def people(*places: Any) -> dict[str, Any]:
     ("account", "others", "measurable", "applies"),
     [
         ({}, {}, True, True),
-        ({"presented": False}, {}, False, False),
         ({"state": State.HOLDING}, {}, False, False),
-        ({"eyes_m": None}, {}, False, False),
         ({}, {"solution": None}, False, False),
         ({}, {"solution": solution(1, None)}, False, False),
         ({}, {"solution": solution(1, EYES[[0, 0]], seeing=(True, False))}, False, False),
@@ -264,7 +251,6 @@ def people(*places: Any) -> dict[str, Any]:
         (people(aside(0.0019), aside(0.3, z_m=-0.0019)), {}, True, True),
         (people(EYES, aside(0.3, z_m=-0.0021)), {}, True, False),
         (people(aside(0.0021), aside(0.3)), {}, True, False),
-        (people(EYES), {}, True, False),  # one has left
     ],
 )
 def test_a_figure_applies_to_a_tracked_viewer_s_same_eyes_and_state(

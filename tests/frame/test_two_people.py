@@ -67,11 +67,24 @@ def test_layers_follow_two_people_who_move_alike() -> None:
         np.testing.assert_allclose(both, one, atol=0.5)  # pixels; the two are at different distances
 
 
+def test_one_person_of_two_is_aligned_exactly_once_the_other_has_left() -> None:
+    moved = TWO[2:] + np.array([0.0, 0.03, 0.0])
+    solved_for_m, eyes_m = matched(solution((1, 2), TWO), estimate((2,), moved))
+    np.testing.assert_array_equal(solved_for_m, TWO[2:])
+    np.testing.assert_array_equal(eyes_m, moved)
+
+
+def test_a_new_person_does_not_move_the_picture_of_the_first() -> None:
+    solved_for_m, eyes_m = matched(solution((1,), TWO[:2]), estimate((1, 2), TWO))
+    np.testing.assert_array_equal(solved_for_m, eyes_m)
+    first, second = accounts_of(solution((1,), TWO[:2]), estimate((1, 2), TWO))
+    assert first.solved_for_m is not None and second.solved_for_m is None and second.number == 2
+
+
 @pytest.mark.parametrize(
     ("numbers", "solved_for", "now"),
     [
         ((3, 1), (0, 2), (1, 0)),  # each where they are in either; the one who has left is left out
-        ((7, 3), (2,), (1,)),  # a new person does not move the other's picture
         ((7, 8), (0,), (0,)),  # nobody it was computed for: the first ones
     ],
 )

@@ -88,6 +88,7 @@ def test_eyes_behind_or_in_the_panels_are_none_counted_by_reason(x_m: float, is_
         place = aside(x_m=x_m - EYES[0, 0])
         seen.take(SensorFrame(number, NS_PER_S + number * NS_PER_S // 30, EyePoints(place, np.ones(2))), serial="")
         told = seen.at(NS_PER_S + number * NS_PER_S // 30 + NS_PER_MS)
+        assert (told.label == "none") != is_seen
         assert (told.eyes_m is not None, told.people, seen.in_view) == ((True, (1,), 1) if is_seen else (False, (), 0))
     assert seen.refused == ({} if is_seen else {"not in front of the panels": 5})
 

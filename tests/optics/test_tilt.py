@@ -67,6 +67,18 @@ def test_what_is_simplified_stays_within_what_is_not_seen(eye: tuple[float, floa
         assert np.abs(exact - simple).max() < 1.5 * UNSEEN_PX * STACK.width_m / STACK.width_px
 
 
+def test_a_tilt_that_nobody_sees_costs_nothing() -> None:
+    hardly = replace(STACK, tilt=Tilt(((0.0, 1e-5, 1e-5),) * 3, PLACE))
+    assert np.array_equal(coarse_layer_from_seen(hardly, 2, np.array(EYES[0])), np.eye(3))
+
+
+def test_a_tilt_about_the_upright_alone_is_a_scale_and_a_shift() -> None:
+    stack = replace(STACK, tilt=Tilt(((0.0, 0.01, 0.0),) * 3, (0.5, 0.0, 0.0)))
+    matrix = coarse_layer_from_seen(stack, 2, np.array([0.5, 0.031, 0.0]))
+    assert matrix[0, 0] != 1.0
+    assert not matrix[[0, 1, 2, 2], [1, 0, 0, 1]].any()
+
+
 @pytest.mark.parametrize(
     ("depth", "eye", "kinds"),
     [
