@@ -98,6 +98,16 @@ def test_a_mistake_is_told_after_ten_samples_and_in_more_than_half() -> None:
     assert told[1].update(p.EXCHANGED) != ""  # 16 of the last 30
 
 
+@pytest.mark.parametrize(
+    ("reason", "remedy"),
+    [(p.MILLIMETRES, "; the driver must deliver metres"), (p.TOO_CLOSE, ""), (p.TOO_FAR_APART, "")],
+)
+def test_a_warning_names_the_mistake_and_its_remedy_if_known(reason: str, remedy: str) -> None:
+    watch = p.RefusalWatch()
+    told = [watch.update(reason) for _ in range(10)]
+    assert told[-1] == watch.warning == f"sensor: the eyes are {reason}{remedy}"
+
+
 def test_a_warning_is_taken_back_below_a_quarter() -> None:
     watch = p.RefusalWatch()
     for _ in range(30):

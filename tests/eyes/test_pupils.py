@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import skimage.data
 
-from runtime.eyes.networks import MODELS
+from runtime.eyes.networks import MODELS, FaceNetwork
 from runtime.eyes.pupils import PupilFinder, find_eyes
 from tests.eyes.scene import Portrait, camera, eileen, grace, scene
 
@@ -171,3 +171,16 @@ def test_a_face_on_the_wall_is_not_taken_again_unless_it_moves() -> None:
     assert found is None and finder.reason == "a face that neither moves nor blinks"
     moved = scene(np.array([-0.40, 0.0, 1.4]), intrinsics=CAMERA, portraits=(grace(),))[0]
     assert finder.find(moved, time_ns=76 * 200_000_000) is not None
+
+
+def test_a_large_picture_is_reduced_before_faces_are_searched() -> None:
+    """Pixels enlarged fourfold and reduced again are the same, so the network finds the same in them."""
+    picture = np.ascontiguousarray(skimage.data.astronaut()[:300, 60:420])
+    faces = FaceNetwork()
+    (face,) = faces.find(picture, longest_px=360, score_min=0.6)
+    (enlarged,) = faces.find(picture.repeat(4, axis=0).repeat(4, axis=1), longest_px=360, score_min=0.6)
+    assert enlarged.score == face.score and face.score > 0.8
+    np.testing.assert_allclose(enlarged.box, 4 * face.box, rtol=1e-9)
+    np.testing.assert_allclose(enlarged.points, 4 * face.points, rtol=1e-9)
+    assert enlarged.size == pytest.approx(4 * face.size)
+    assert np.ptp(face.points[:2, 0]) / face.size == pytest.approx(0.4, abs=0.15)  # of the eyes, to the face
