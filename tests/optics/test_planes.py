@@ -139,8 +139,10 @@ def test_gaps_that_differ_by_up_to_15_percent_are_even(x_m: tuple[float, ...], i
 def test_a_rectangle_and_those_beside_it_cover_a_raster_once(u0: int, v0: int, u1: int, v1: int, rows: int) -> None:
     box = PixelRect(*np.clip([u0, v0, u1, v1], 0, 6).tolist())
     covered = np.zeros((6, 6), int)
-    for part in [*box.in_rows(rows), *box.beside(width_px=6, height_px=6)]:
+    beside = box.beside(width_px=6, height_px=6)
+    for part in [*box.in_rows(rows), *beside]:
         covered[part.slices] += 1
+    assert all(part.width_px and part.height_px for part in beside)
     filled = box.u1 > box.u0 and box.v1 > box.v0
     assert (covered == 1).all()
     assert all(part.height_px <= rows for part in box.in_rows(rows))
