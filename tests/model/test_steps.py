@@ -206,7 +206,7 @@ def test_every_step_makes_light_better(stack: PanelStack, sigma_mm: float) -> No
     pictures = [card_scene(eye) for eye in pair]
     solver = load_predictor("best", stack, ModelSettings(threads=2))
     job = Job(Targets(stack, pair, captured_views(pictures, pair, stack, fov_deg=FOV_DEG)), eye_sigma_m=sigma_mm / 1e3)
-    for count in (0, 1, 3, solver.steps):
+    for count in (0, 1, 3, solver.facts.steps):
         layers = solver.solve(replace(job, steps=count)).layers
         light_db = expected_psnrs_db(layers, pictures, stack, eyes_m=pair, fov_deg=FOV_DEG, sigmas_mm=[sigma_mm])
         found_db.append(light_db[sigma_mm])
