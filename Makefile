@@ -19,7 +19,7 @@ SANITIZED := out/sanitized
 SANITIZERS := -fsanitize=address,undefined -fno-sanitize-recover=all
 SANITIZE_ARGS ?=
 # Tests of processes with little memory, in which the sanitizers' own does not fit.
-LIMITED := --ignore tests/model/test_session.py --ignore tests/model/test_picture_networks.py -k "not too_little_memory and not inputs_of_another_version and not named_file_never"
+LIMITED := --ignore tests/model/test_session.py --ignore tests/model/test_picture_networks.py -k "not too_little_memory and not inputs_of_another_version and not named_file_never and not splats"
 
 .PHONY: demo test test-setup test-slow golden lint types secrets coverage nightly package bench fuzz mutate soak faults install uninstall system eye-models models gallery site hashes clean
 

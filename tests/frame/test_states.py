@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import pytest
@@ -110,3 +111,18 @@ def test_a_late_display_is_on_time_again_only_well_above_that(of_60: int, late: 
     lateness = Lateness(NS_PER_S // 60)
     assert shown(lateness, of_60=40, from_s=0, to_s=5)[-1]
     assert bool(shown(lateness, of_60=of_60, from_s=5, to_s=10)[-1]) == late
+
+
+def test_the_count_of_a_late_display_changes_once_a_second() -> None:
+    lateness = Lateness(NS_PER_S // 60)
+    shown(lateness, of_60=48, from_s=1000, to_s=1005)
+    told = shown(lateness, of_60=30, from_s=1005, to_s=1007)
+    changes = [n for n in range(1, len(told)) if told[n] != told[n - 1]]
+    assert all(later - earlier == 60 for earlier, later in itertools.pairwise(changes)) and 1 <= len(changes) <= 2
+    assert told[-1] == "late: 30 of 60 refreshes per second"
+
+
+def test_a_second_that_was_late_by_itself_is_forgiven() -> None:
+    lateness = Lateness(NS_PER_S // 60)
+    told = [*shown(lateness, of_60=60, from_s=0, to_s=3), *shown(lateness, of_60=50, from_s=3, to_s=4)]
+    assert not any([*told, *shown(lateness, of_60=60, from_s=4, to_s=6)])
