@@ -1,116 +1,55 @@
-"""Tests that drawing only the part that a solution fills shows the same as drawing everything."""
+"""Tests which part of a screen shows the filled part of a layer."""
 
 from __future__ import annotations
 
-from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from hypothesis import given
+from hypothesis import strategies as st
 
-from runtime.config import PanelSettings
-from runtime.optics.alignment import align
-from runtime.optics.malus import rest_code
+from runtime.kernels import ScaleShift, ShownPanel
 from runtime.optics.rect import PixelRect
-from runtime.optics.stack import PanelStack
-from runtime.panels.presentation import mount_of
-from runtime.panels.processor import Mounting, ProcessorPainter
-from runtime.records import F64, U8, PanelFrame
+from runtime.panels.shown_part import filled_part
 
-WIDTH, HEIGHT = 480, 320
-STACK = PanelStack(0.5184, 0.3456, (-0.1, 0.0, 0.06), WIDTH, HEIGHT)
-HEAD = np.array([[0.7, 0.0315, 0.0], [0.7, -0.0315, 0.0]])
-KEYSTONE = ((1.01, 0.01, -4.0), (-0.01, 0.99, 3.0), (4e-5, -2e-5, 1.0))
-MOUNTINGS = {
-    "plain": PanelSettings(),
-    "turned": PanelSettings(rotation_deg=90),
-    "mirrored": PanelSettings(rotation_deg=180, mirror="horizontal"),
-    "curved": PanelSettings(gamma=2.0),
-    "registered": PanelSettings(homography=KEYSTONE, rotation_deg=180),
-}
+BOX = PixelRect(30, 22, 70, 51)
+SIZE = {"columns": 120, "rows": 90, "panel_columns": 120, "panel_rows": 90}
 
 
-def painter(settings: PanelSettings) -> tuple[ProcessorPainter, list[U8]]:
-    screen_px = (HEIGHT, WIDTH) if settings.rotation_deg == 90 else (WIDTH, HEIGHT)
-    mounting = Mounting.of(settings, screen_px=screen_px, layer_px=(WIDTH, HEIGHT))
-    screens = [np.zeros((*screen_px[::-1], 4), np.uint8) for _ in range(3)]
-    mount = mount_of(settings, screen_px=screen_px, layer_px=(WIDTH, HEIGHT))
-    return ProcessorPainter((mount,) * 3, (mounting,) * 3, screens), screens
+def shown(to: Any = (1.0, 1.0, 0.0, 0.0), push: Any = (0.0, 0.0, 0.0, 0.0), **size: int) -> ShownPanel:
+    return ShownPanel(source_from_panel=ScaleShift(*to), push=ScaleShift(*push), **{**SIZE, **size})
 
 
-def sparse_layers(box: PixelRect, seed: int, *, coarser: int) -> U8:
-    """Random colours in a box of panel pixels, and the rest code around it."""
-    layers = np.full((3, HEIGHT // coarser, WIDTH // coarser, 4), rest_code(3), np.uint8)
-    rows, columns = (slice(s.start // coarser, s.stop // coarser) for s in box.slices)
-    found = np.random.default_rng(seed).integers(0, 256, layers[:, rows, columns].shape, np.uint8)
-    layers[:, rows, columns] = found
-    return layers
+scales, shifts = st.floats(0.5, 2.0), st.floats(-30, 30)
+pushes = st.tuples(st.floats(-0.1, 0.1), st.floats(-0.1, 0.1), st.floats(-5, 5), st.floats(-5, 5))
 
 
-def frame(number: int, layers: U8, eyes_m: F64, *, flatness: float = 0.0, relief: bool = True) -> PanelFrame:
-    seen = align(STACK, solved_for_m=HEAD, eyes_m=eyes_m)
-    raised = np.zeros((HEIGHT // 16, WIDTH // 16), np.float32)
-    raised[5:12, 8:20] = 0.08
-    flat = np.full((3, HEIGHT, WIDTH, 4), 60, np.uint8)
-    return PanelFrame(
-        number, layers, number // 2, seen.solved_from_shown, flat, 1, flatness, (WIDTH, HEIGHT),
-        raised if relief else None, seen.parallax if relief else None,
-    )  # fmt: skip
+@given(st.tuples(scales, scales, shifts, shifts), pushes, st.sampled_from([0.0, 0.5, 2.0]))
+def test_the_part_has_every_pixel_that_shows_the_box_and_hardly_more(to: Any, push: Any, rise: float) -> None:
+    part = filled_part(shown(to, push), BOX, rise=rise, screen_from_panel=None)
+    for axis, (count, begin, end) in enumerate(((120, part.u0, part.u1), (90, part.v0, part.v1))):
+        first, last = (BOX.u0, BOX.u1) if axis == 0 else (BOX.v0, BOX.v1)
+        at = np.arange(count) + 0.5
+        source, moved = to[axis] * at + to[axis + 2], rise * np.abs(push[axis] * at + push[axis + 2])
+        shows = (source + moved > first - 0.5) & (source - moved < last + 0.5)
+        inside = (begin <= at) & (at < end)
+        assert inside[shows].all()
+        most = rise * np.abs(push[axis] * np.linspace(0, count, 50) + push[axis + 2]).max()
+        far = (source + most < first - 5 - 5 * to[axis]) | (source - most > last + 5 + 5 * to[axis])
+        assert not inside[far].any() and begin % 2 == 0
 
 
-def differences(settings: PanelSettings, frames: list[PanelFrame]) -> tuple[list[int], list[float]]:
-    """Largest differences in codes from a fresh painter, and the drawn shares of the pictures, frame by frame."""
-    kept, screens = painter(settings)
-    found, shares = [], []
-    for one in frames:
-        parts = kept.draw(one)
-        fresh, expected = painter(settings)
-        fresh.draw(one)
-        found.append(max(int(np.abs(a.astype(int) - b).max()) for a, b in zip(screens, expected, strict=True)))
-        shares.append(sum(part.width_px * part.height_px for part in parts.values()) / (3 * WIDTH * HEIGHT))
-    return found, shares
+def test_the_part_of_a_registered_panel_is_that_of_its_corners() -> None:
+    large = shown(columns=240, rows=180)
+    assert filled_part(large, BOX, screen_from_panel=np.diag([2.0, 2.0, 1.0])) == PixelRect(54, 38, 146, 108)
+    turned = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    assert filled_part(large, BOX, screen_from_panel=turned) == PixelRect(18, 26, 55, 74)
+    horizon = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1 / 60, 0.0, 1.0]])
+    assert filled_part(large, BOX, screen_from_panel=horizon) == PixelRect(0, 0, 240, 180)
 
 
-@pytest.mark.parametrize("coarser", [1, 4])
-@pytest.mark.parametrize("mounted", MOUNTINGS)
-def test_pictures_are_the_same_if_only_filled_parts_are_drawn(mounted: str, coarser: int) -> None:
-    random = np.random.default_rng(5)
-    boxes = [PixelRect(96, 64, 320, 240), PixelRect(160, 96, 360, 200), PixelRect(0, 0, 60, 320)]
-    frames = []
-    for number in range(2, 14):
-        layers = sparse_layers(boxes[number // 2 % 3], number // 2, coarser=coarser)
-        frames.append(frame(number, layers, HEAD + random.uniform(-0.02, 0.02, 3), relief=number // 2 % 3 > 0))
-    found, shares = differences(MOUNTINGS[mounted], frames)
-    steps = 2 if mounted == "curved" else 1  # where a curve is steep, rounding by one code shows as several
-    assert max(found) <= steps
-    assert shares[0] == 1.0 and max(shares[1:]) < 0.85
-
-
-@pytest.mark.parametrize("mounted", MOUNTINGS)
-def test_after_a_blend_with_the_flat_picture_everything_is_drawn_once(mounted: str) -> None:
-    layers = sparse_layers(PixelRect(96, 64, 320, 240), 1, coarser=1)
-    moved = [HEAD + np.array([0.0, shift, 0.0]) for shift in (0.001, 0.002, 0.003, 0.004)]
-    frames = [frame(2, layers, eyes, flatness=flatness) for eyes, flatness in zip(moved, (1, 0.5, 0, 0), strict=True)]
-    found, shares = differences(MOUNTINGS[mounted], frames)
-    assert max(found) <= (2 if mounted == "curved" else 1)
-    assert shares[:3] == [1.0, 1.0, 1.0] and shares[3] < 0.6
-
-
-def test_nothing_is_drawn_where_layers_rest() -> None:
-    kept, screens = painter(PanelSettings())
-    layers = np.full((3, HEIGHT, WIDTH, 4), rest_code(3), np.uint8)
-    kept.draw(frame(2, layers, HEAD))
-    assert kept.draw(frame(4, layers, HEAD + 0.01)) == {}
-    for screen in screens:
-        screen[:, :8] = 7
-    kept.draw(frame(6, sparse_layers(PixelRect(96, 64, 320, 240), 1, coarser=1), HEAD + 0.01))
-    assert all((screen[:, :8] == 7).all() and screen.std() > 20 for screen in screens)
-
-
-def test_layers_without_a_resting_border_are_drawn_whole() -> None:
-    kept, _ = painter(PanelSettings())
-    layers: NDArray[np.uint8] = np.random.default_rng(1).integers(0, 256, (3, HEIGHT, WIDTH, 4), np.uint8)
-    frames = [frame(number, layers, HEAD + number / 1e3) for number in (2, 3)]
-    parts = [kept.draw(one) for one in frames]
-    assert all(set(part.values()) == {PixelRect(0, 0, WIDTH, HEIGHT)} for part in parts)
-    assert all(len(part) == 3 for part, _ in pairwise(parts))
+@pytest.mark.parametrize("box", [PixelRect(5, 5, 5, 9), PixelRect(5, 5, 9, 5)])
+def test_nothing_is_filled_by_an_empty_box(box: PixelRect) -> None:
+    part = filled_part(shown(), box, screen_from_panel=None)
+    assert not part.width_px and not part.height_px
