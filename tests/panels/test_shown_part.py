@@ -45,6 +45,8 @@ def test_the_part_of_a_registered_panel_is_that_of_its_corners() -> None:
     assert filled_part(large, BOX, screen_from_panel=np.diag([2.0, 2.0, 1.0])) == PixelRect(54, 38, 146, 108)
     turned = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     assert filled_part(large, BOX, screen_from_panel=turned) == PixelRect(18, 26, 55, 74)
+    oblique = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.002, 0.0, 1.0]])
+    assert filled_part(large, BOX, screen_from_panel=oblique) == PixelRect(24, 14, 65, 53)
     horizon = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1 / 60, 0.0, 1.0]])
     assert filled_part(large, BOX, screen_from_panel=horizon) == PixelRect(0, 0, 240, 180)
 
