@@ -206,13 +206,11 @@ def _best_half(sensor_m: F64, stack_m: F64, *, random: np.random.Generator) -> N
 
 def fit_robust(sensor_m: F64, stack_m: F64) -> RobustFit:
     """Fit a similarity, deterministically, to those of K >= 3 points (K, 3) in `sensor` and `stack` that
-    agree. Five pairs or fewer have no clear majority, so all of them are used. Raises Degenerate as `similarity.fit`.
+    agree. Five pairs or fewer are all used, because half of them means every one. Raises Degenerate as `fit`.
     """
     count = len(sensor_m)
     everything = fit(sensor_m, stack_m, rule=RULE)
     spread = float(np.sqrt(((stack_m - stack_m.mean(0)) ** 2).sum(-1).mean()))
-    if count <= 5:
-        return RobustFit(everything, np.ones(count, bool))
     random = np.random.default_rng(0)
     scored = random.permutation(count)[:MAX_SCORED] if count > MAX_SCORED else np.arange(count)
     # The points are centred for precision, because the batched fits are only as precise as the cross-covariance.

@@ -183,4 +183,5 @@ def test_a_large_picture_is_reduced_before_faces_are_searched() -> None:
     np.testing.assert_allclose(enlarged.box, 4 * face.box, rtol=1e-9)
     np.testing.assert_allclose(enlarged.points, 4 * face.points, rtol=1e-9)
     assert enlarged.size == pytest.approx(4 * face.size)
+    assert ((face.box[:2] < face.points) & (face.points < face.box[:2] + face.box[2:])).all()
     assert np.ptp(face.points[:2, 0]) / face.size == pytest.approx(0.4, abs=0.15)  # of the eyes, to the face
