@@ -32,7 +32,8 @@ class Serving:
         self._channel, self._token = channel, token
         self._servers: dict[int, ProgramServer] = {}  # keyed by the port asked for
         self._addresses: dict[int, str] = {}  # address of the last server, keyed likewise
-        self._told: dict[int, ServerState] = {}  # latest state sent, keyed likewise
+        self._telling = threading.Lock()  # held from reading a state until it is sent, so that the newest is sent last
+        self._told: dict[int, ServerState] = {}  # latest state that was sent, keyed likewise
         self._waiters = ThreadPoolExecutor(IN_FLIGHT_MAX + 1, "programs' answers")
         self._lock = threading.Lock()  # for the fields below
         self._memory: ProgramMemory | None = None  # for pictures that programs have sent
@@ -109,12 +110,12 @@ class Serving:
             self._memory = None
 
     def _tell(self, port: int, server: ProgramServer) -> None:
-        state = ServerState(port, server.problem, server.frame_ms)
-        if self._told.get(port) != state:
-            self._told[port] = state
-            self._send(state)
+        with self._telling:
+            state = ServerState(port, server.problem, server.frame_ms)
+            if self._told.get(port) != state and self._channel.send(state, timeout_s=SENT_S):
+                self._told[port] = state
 
-    def _send(self, message: ServerAddress | FrameAnswer | ServerState) -> None:
+    def _send(self, message: ServerAddress | FrameAnswer) -> None:
         self._channel.send(message, timeout_s=SENT_S)
 
 

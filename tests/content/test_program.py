@@ -36,6 +36,7 @@ from runtime.content import program_link, program_server
 from runtime.content.placed import Placing, placed_source
 from runtime.content.program import camera_of, nearness_of
 from runtime.content.program_link import ProgramLink
+from runtime.content.program_serving import Serving
 from runtime.content.registry import open_content
 from runtime.daemon.programs import Programs
 from runtime.errors import ContentFailure, InputError
@@ -151,6 +152,35 @@ def test_both_eyes_are_asked_for_at_once_and_get_their_own_picture(either: Any) 
     assert (left[..., 0] == 200).all() and (right[..., 0] == 100).all() and (left[:, 5, 1] == np.arange(36)).all()
     assert 0 < either.program["frame_ms"] < 400 and either.problem == ""
     program.end()
+
+
+def test_the_newest_state_of_a_server_is_told_last_and_a_lost_one_again() -> None:
+    """Threads that wait for pictures tell it as well as the one that takes instructions."""
+    sending, sent = threading.Event(), []
+
+    class Slow(Channel):
+        def send(self, message: Any, *, timeout_s: float = 0.0) -> bool:
+            sending.set()
+            time.sleep(0.3 if message.frame_ms is None else 0)
+            sent.append(message.frame_ms)
+            return sent.count(5.0) != 1  # lost, because too many are unread
+
+    class Server:
+        problem, frame_ms = "", None
+
+    ours, theirs = sockets.socketpair()
+    channel, server = Slow.of(ours.detach()), Server()
+    serving = Serving(channel, "token")
+    telling = threading.Thread(target=serving._tell, args=(0, server))
+    telling.start()
+    sending.wait()
+    server.frame_ms = 5.0
+    for _ in range(3):
+        serving._tell(0, server)
+    telling.join()
+    assert sent == [None, 5.0, 5.0]
+    channel.close()
+    theirs.close()
 
 
 def test_rows_may_come_from_below_as_opengl_reads_them(source: Any) -> None:
