@@ -154,7 +154,7 @@ def test_both_eyes_are_asked_for_at_once_and_get_their_own_picture(either: Any) 
     program.end()
 
 
-def test_the_newest_state_of_a_server_is_told_last_and_a_lost_one_again() -> None:
+def test_the_newest_state_is_told_last_and_a_lost_one_again() -> None:
     """Threads that wait for pictures tell it as well as the one that takes instructions."""
     sending, sent = threading.Event(), []
 
