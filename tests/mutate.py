@@ -34,6 +34,7 @@ TESTS_OF = {
     "kernels": ("model", "panels", "optics", "content/test_fringe.py"),
     "plan": ("plan", "frame"),
     "optics": ("optics", "panels/test_presentation_table.py"),
+    "panels": ("panels", "daemon/test_display.py"),
     "browser": ("daemon", "browser"),
     "page": ("page", "browser"),
 }

@@ -63,7 +63,7 @@ def _bound(settings: Settings) -> tuple[PanelSink, list[U8]]:
 
     stack = settings.stack.stack()
     mounted = settings.output.panels
-    panels = WindowPanels(mounted, stack, MonotonicClock(), offscreen_context())
+    panels = WindowPanels(mounted, (stack.width_px, stack.height_px), MonotonicClock(), offscreen_context())
     cards = []
     for index, (panel, monitor) in enumerate(zip(mounted, panels.monitors, strict=True)):
         typer.echo(f"panel {index}: {monitor}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import cv2
@@ -9,7 +10,7 @@ import numpy as np
 
 from runtime.records import U8
 
-INK = (255, 255, 255, 255)
+INK = (255,) * 4
 PAPER = (24, 28, 36, 255)
 BARS = ((255, 0, 0), (0, 255, 0), (0, 0, 255), (0, 255, 255), (255, 0, 255), (255, 255, 0), (255, 255, 255))
 FONT = cv2.FONT_HERSHEY_SIMPLEX
@@ -50,17 +51,15 @@ def alone(cards: Sequence[U8], index: int) -> U8:
 def _bars(card: U8, *, top: int) -> None:
     height, width = card.shape[:2]
     middle = (top + height) // 2
-    for index, colour in enumerate(BARS):
-        card[top:middle, width * index // len(BARS) : width * (index + 1) // len(BARS), :3] = colour
+    for index, colour in enumerate(BARS):  # each as far as the edge, where the next ones are drawn over it
+        card[top:middle, width * index // len(BARS) :, :3] = colour
     steps = 16
     for index in range(steps):
-        columns = slice(width * index // steps, width * (index + 1) // steps)
-        card[middle:, columns, :3] = round(255 * index / (steps - 1))
+        card[middle:, width * index // steps :, :3] = round(255 * index / (steps - 1))
 
 
 def _arrow(card: U8, *, x_px: int, top: int, bottom: int, unit: float) -> None:
-    width = max(2, round(2 * unit))
-    cv2.arrowedLine(card, (x_px, bottom), (x_px, top), INK, width, cv2.LINE_AA, tipLength=0.25)
+    cv2.arrowedLine(card, (x_px, bottom), (x_px, top), INK, math.ceil(2 * unit), cv2.LINE_AA, tipLength=0.25)
     _text(card, "UP", x_px=x_px + round(4 * unit), y_px=(top + bottom) // 2, height=6 * unit, room=14 * unit)
     _text(card, "RIGHT >", x_px=x_px - round(10 * unit), y_px=bottom + round(8 * unit), height=4 * unit, room=26 * unit)
 
@@ -69,5 +68,5 @@ def _text(card: U8, text: str, *, x_px: int, y_px: int, height: float, room: flo
     # OpenCV's Hershey fonts cover only ASCII.
     plain = text.encode("ascii", "replace").decode()
     (full, tall), _ = cv2.getTextSize(plain, FONT, 1.0, 1)
-    scale = min(height / tall, room / max(full, 1))
-    cv2.putText(card, plain, (x_px, y_px), FONT, scale, INK, max(1, round(scale * 1.6)), cv2.LINE_AA)
+    scale = min(height / tall, room / full)
+    cv2.putText(card, plain, (x_px, y_px), FONT, scale, INK, math.ceil(scale * 1.6), cv2.LINE_AA)

@@ -39,11 +39,8 @@ def gl_function(name: str) -> int:
     return int(glfw.get_proc_address(name) or 0)
 
 
-class WindowContext:
-    """A GLFW window's GL context, from which moderngl loads functions and which it makes current."""
-
-    def __init__(self, window: Any) -> None:
-        self._window = window
+class _Functions:
+    """OpenGL's functions for moderngl. `Window.make_current` makes contexts current."""
 
     def load_opengl_function(self, name: str) -> int:
         """Return an OpenGL function's address, or 0."""
@@ -51,14 +48,8 @@ class WindowContext:
 
     load = load_opengl_function
 
-    def __enter__(self) -> None:
-        glfw.make_context_current(self._window)
-
-    def __exit__(self, *exception: object) -> None:
-        """Leave the context current."""
-
     def release(self) -> None:
-        """Do nothing, because the context belongs to the window."""
+        """Do nothing, because contexts belong to their windows."""
 
 
 @dataclass(eq=False)
@@ -159,13 +150,9 @@ class Display:
         """Close all windows except the hidden root window."""
         self._close_from(1)
         self.faults.clear()
-        if self._windows:
-            self._windows[0].make_current()
 
     def close(self) -> None:
         """Close every window, including the hidden root window. May be called more than once."""
-        if self._windows:
-            glfw.make_context_current(None)
         self._close_from(0)
 
     def _close_from(self, first: int) -> None:
@@ -178,7 +165,7 @@ class Display:
     def _adopt(self, handle: Any, *, opengl: bool = True) -> Window:
         if opengl:
             glfw.make_context_current(handle)
-        window = Window(handle, _attach(handle) if opengl else None)
+        window = Window(handle, _attach() if opengl else None)
 
         def closed(_handle: Any) -> None:
             window.faults.append("a panel's window was closed")
@@ -212,9 +199,7 @@ class Display:
             mode = glfw.get_video_mode(handle)
             x_px, y_px = glfw.get_monitor_pos(handle)
             state = self.output_state(connector)
-            identity = edid.parse(state.edid) if state is not None and state.edid else None
-            # GLFW's refresh rate is rounded to an integer.
-            refresh_hz = state.refresh_hz if state is not None and state.refresh_hz else float(mode.refresh_rate)
+            identity = edid.parse(state.edid) if state else None
             monitor = Monitor(
                 connector=connector,
                 serial=identity.serial if identity else "",
@@ -223,7 +208,7 @@ class Display:
                 y_px=y_px,
                 width_px=mode.size.width,
                 height_px=mode.size.height,
-                refresh_hz=refresh_hz,
+                refresh_hz=state.refresh_hz if state else 0.0,  # GLFW rounds the rate to an integer
                 has_gamma=_has_gamma(handle),
             )
             pairs.append((monitor, handle))
@@ -251,24 +236,19 @@ def _has_gamma(monitor: Any) -> bool:
 
 def x_display() -> int:
     """Return a pointer to GLFW's connection to the X server, an Xlib `Display`."""
-    pointer = glfw.get_x11_display()
-    return int(getattr(pointer, "value", pointer) or 0)
+    return int(glfw.get_x11_display())
 
 
 def connected_monitors() -> tuple[Monitor, ...]:
     """Return the active monitors, left to right. Raises PanelLost without any, or MissingPart."""
-    display = Display()
-    try:
-        monitors = display.monitors()
-    finally:
-        display.close()
+    monitors = Display().monitors()
     if not monitors:
         raise PanelLost("no monitor is active on the X server")
     return monitors
 
 
-def _attach(handle: Any) -> moderngl.Context:
-    settings: dict[str, Any] = {"context": WindowContext(handle)}
+def _attach() -> moderngl.Context:
+    settings: dict[str, Any] = {"context": _Functions()}
     return moderngl.create_context(require=MINIMUM_VERSION, **settings)
 
 
@@ -283,8 +263,6 @@ def _hints() -> None:
     glfw.window_hint(glfw.OPENGL_PROFILE, glfw.OPENGL_CORE_PROFILE)
     glfw.window_hint(glfw.CONTEXT_ROBUSTNESS, glfw.LOSE_CONTEXT_ON_RESET)
     glfw.window_hint(glfw.AUTO_ICONIFY, False)
-    glfw.window_hint(glfw.FOCUS_ON_SHOW, False)
-    glfw.window_hint(glfw.RESIZABLE, False)
 
 
 def _text(error: Exception) -> str:

@@ -75,7 +75,6 @@ class ShaderWindows(PanelWindows):
         """Open the windows. Raises PanelLost if a monitor is no longer connected, or X does not support OpenGL."""
         super().__init__()
         self._display = display
-        display.root.make_current()
         self._textures = FrameTextures(display.root.gl, count=len(mounts))
         self._painters: list[Painter] = []
         try:
@@ -99,7 +98,6 @@ class ShaderWindows(PanelWindows):
         for panel, (window, painter, draw) in enumerate(zip(self.windows, self._painters, draws, strict=True)):
             window.make_current()
             context = window.gl
-            context.screen.use()
             context.viewport = (0, 0, *painter.mount.screen_px)
             painter.draw(self._textures, draw, panel)
             context.finish()
@@ -118,7 +116,6 @@ class ShaderWindows(PanelWindows):
         for window, painter in zip(self.windows, self._painters, strict=False):  # the last one may have none
             window.make_current()
             painter.release()
-        self._display.root.make_current()
         self._textures.release()
 
     def abandon(self) -> None:

@@ -41,6 +41,6 @@ def _text(block: bytes, tag: int) -> str:
         descriptor = block[start : start + 18]
         if descriptor[:3] == b"\x00\x00\x00" and descriptor[3] == tag:
             # Ends with a line feed by the standard, and with zeros in many monitors.
-            text = re.split(rb"[\n\0]", descriptor[5:18])[0].decode("cp437")
+            text = re.split(rb"[\n\0]", descriptor[5:])[0].decode("cp437")
             return "".join(filter(str.isprintable, text)).strip()
     return ""

@@ -75,11 +75,9 @@ def permutes_pixels(matrix: F64) -> bool:
         return False
     m = matrix / matrix[2, 2]
     affine = np.abs(m[2, :2]).max() < 1e-15
-    turn = np.allclose(np.abs(m[:2, :2]).sum(axis=0), 1.0, atol=1e-12) and np.allclose(
-        m[:2, :2], np.rint(m[:2, :2]), atol=1e-12
-    )
-    centre = m @ np.array([0.5, 0.5, 1.0])
-    return bool(affine and turn and np.allclose((centre[:2] - 0.5) % 1.0 % 1.0, 0.0, atol=1e-9))
+    turn, moved = np.rint(m[:2, :2]), (m @ np.array([0.5, 0.5, 1.0]))[:2] - 0.5
+    turns = (np.abs(turn).sum(axis=0) == 1).all() and np.allclose(m[:2, :2], turn, atol=1e-12)
+    return bool(affine and turns and np.allclose(moved, np.rint(moved), rtol=0.0, atol=1e-9))
 
 
 Arrow = Literal["up", "down", "left", "right"]

@@ -38,10 +38,9 @@ def measured_curve(path: Path) -> F32:
     if (np.diff(table[:, 0]) <= 0.0).any():
         raise InputError(path, "phase", "must increase from row to row")
     phases = np.linspace(0.0, 1.0, ENTRIES)
-    greys = table[:, 1:] if table.shape[1] == 4 else np.repeat(table[:, 1:2], 3, axis=1)
-    return np.stack([np.interp(phases, table[:, 0], greys[:, channel]) for channel in range(3)], axis=1).astype(
-        np.float32
-    )
+    columns = (1, 2, 3) if header == COLUMNS else (1, 1, 1)
+    greys = [np.interp(phases, table[:, 0], table[:, column]) for column in columns]
+    return np.stack(greys, axis=1).astype(np.float32)
 
 
 def curve(*, lut: str, gamma: float) -> F32:

@@ -151,7 +151,7 @@ def gamma_warning(monitors: Sequence[Monitor]) -> str:
 
 def refresh_difference(monitors: Sequence[Monitor]) -> str:
     """Return a one-line warning if the known refresh rates differ, or an empty string."""
-    known = [monitor for monitor in monitors if monitor.refresh_hz > 0]
+    known = [monitor for monitor in monitors if monitor.refresh_hz]
     rates = [monitor.refresh_hz for monitor in known]
     if not rates or max(rates) - min(rates) <= REFRESH_TOLERANCE_HZ:
         return ""

@@ -129,9 +129,6 @@ def cases_of(mount: Mount) -> tuple[Case, ...]:
     return ((), *(("SOLVED", *way, *mixed) for way in ways for mixed in ((), ("MIXED",))))
 
 
-IDENTITY = np.repeat(np.linspace(0.0, 1.0, lut.ENTRIES, dtype=np.float32)[:, None], 3, axis=1)
-
-
 class FrameTextures:
     """Uploads the latest frame's layers to textures whenever their version changes."""
 
@@ -231,10 +228,11 @@ class Painter:
         """Compile the shader for one monitor, in its window's context."""
         self.mount = mount
         mounting = ["EXACT"] * mount.is_exact + ["CURVED"] * (mount.curve is not None)
-        table = np.ascontiguousarray((IDENTITY if mount.curve is None else mount.curve).T)
-        self._curve = context.texture((lut.ENTRIES, 3), 1, table.tobytes(), dtype="f4")
-        self._curve.filter = (moderngl.LINEAR, moderngl.LINEAR)
-        self._curve.repeat_x = self._curve.repeat_y = False
+        self._curve: moderngl.Texture | None = None
+        if mount.curve is not None:
+            table = np.ascontiguousarray(mount.curve.T)
+            self._curve = context.texture((lut.ENTRIES, 3), 1, table.tobytes(), dtype="f4")
+            self._curve.filter = (moderngl.LINEAR, moderngl.LINEAR)
         fixed = {
             "solved": 0, "flat_picture": 1, "curve": 2, "relief": 3,
             "screen_px": tuple(map(float, mount.screen_px)),
@@ -245,21 +243,22 @@ class Painter:
     def draw(self, textures: FrameTextures, draw: PanelDraw, index: int) -> None:
         """Draw panel `index` of an uploaded frame to the bound framebuffer."""
         program, array = self._cases[case_of(draw)]
-        relief_px = (1, 1) if draw.relief is None else draw.relief.shape[::-1]
         values: dict[str, Any] = {
             "rest": draw.rest / 255,
             "size_px": tuple(map(float, draw.size_px)),
             "solved_px": tuple(map(float, draw.solved_px)),
-            "relief_px": tuple(map(float, relief_px)),
             "extended_px": draw.extended_px,
             "solved_from_shown": tuple(draw.solved_from_shown),
             "relief_from_shown": tuple(draw.relief_from_shown),
             "push": tuple(draw.push),
             "flatness": draw.flatness,
         }
+        if draw.relief is not None:
+            values["relief_px"] = tuple(map(float, draw.relief.shape[::-1]))
         set_uniforms(program, values)
         textures.use(index)
-        self._curve.use(2)
+        if self._curve is not None:
+            self._curve.use(2)
         array.render(moderngl.TRIANGLES, vertices=3)
 
     def release(self) -> None:
@@ -267,7 +266,8 @@ class Painter:
         for program, array in self._cases.values():
             array.release()
             program.release()
-        self._curve.release()
+        if self._curve is not None:
+            self._curve.release()
 
 
 def _compiled(

@@ -79,7 +79,7 @@ class Mounting(NamedTuple):
         turn = panel_from_screen(screen_width_px=turned_px[0], screen_height_px=turned_px[1], **mounted)
         axes = []
         for column in (0, 1):
-            layer_axis = int(abs(turn[1, column]) > 0.5)
+            layer_axis = round(abs(turn[1, column]))
             axes.append(Axis(layer_axis, round(turn[layer_axis, column]), float(turn[layer_axis, 2])))
         turned = np.asarray(np.linalg.solve(turn, layer_from_monitor), np.float64)
         turned /= turned[2] @ np.array([screen_px[0] / 2, screen_px[1] / 2, 1.0])  # its sign is arbitrary
@@ -100,9 +100,15 @@ class _Pictures:
     """Pictures of one version, one for each panel, prepared for drawing."""
 
     version: int
+    pictures: tuple[U8, ...]  # RGBA, turned for the monitors
+
+
+@dataclass(slots=True)
+class _Solution(_Pictures):
+    """Pictures of a solution, which are moved, and surrounded by the rest code."""
+
     size_px: tuple[int, int]  # width and height as seen by the viewer
     border_px: int
-    pictures: tuple[U8, ...]  # RGBA, turned for the monitors
     boxes: tuple[PixelRect, ...]  # in each picture, what differs from the rest code
     reliefs: tuple[F32, ...] = ()
     rises: tuple[float, ...] = ()  # each relief's largest absolute value
@@ -145,7 +151,7 @@ class ProcessorPainter:
         """Prepare to draw into each panel's (h, w, 4) picture, in BGRX order."""
         self._mounts, self._mountings, self._screens = mounts, mountings, screens
         self._curves = [None if mount.curve is None else _curve_table(mount.curve) for mount in mounts]
-        self._solved: _Pictures | None = None
+        self._solved: _Solution | None = None
         self._flat: _Pictures | None = None
         self._solved_memory, self._flat_memory = _PictureMemory(mountings), _PictureMemory(mountings)
         self._drawn: list[object] = [None] * len(screens)  # key of each picture's content
@@ -174,14 +180,14 @@ class ProcessorPainter:
         self._drawn, self._filled = drawn, filled
         return parts
 
-    def _filled_by(self, panel: int, shown: ShownPanel, solved: _Pictures | None) -> PixelRect:
+    def _filled_by(self, panel: int, shown: ShownPanel, solved: _Solution | None) -> PixelRect:
         """Return the part of a picture outside which it shows the rest code; `solved` may be None."""
         if solved is None:
             return _whole(self._screens[panel])
         mounting, rise = self._mountings[panel], solved.rises[panel] if shown.relief else 0.0
         return filled_part(shown, solved.boxes[panel], rise=rise, screen_from_panel=mounting.screen_from_turned)
 
-    def _prepared_solution(self, frame: PanelFrame, draws: Sequence[PanelDraw]) -> _Pictures:
+    def _prepared_solution(self, frame: PanelFrame, draws: Sequence[PanelDraw]) -> _Solution:
         assert frame.solved is not None
         if self._solved is None or self._solved.version != frame.solved_version:
             height, width = frame.solved.shape[1:3]
@@ -193,7 +199,7 @@ class ProcessorPainter:
             if frame.relief is not None:
                 reliefs = tuple(np.ascontiguousarray(mounting.on_screen(frame.relief)) for mounting in self._mountings)
                 rises = tuple(float(np.abs(relief).max()) for relief in reliefs)
-            self._solved = _Pictures(frame.solved_version, (width, height), border_px, pictures, boxes, reliefs, rises)
+            self._solved = _Solution(frame.solved_version, pictures, (width, height), border_px, boxes, reliefs, rises)
         return self._solved
 
     def _prepared_flat(self, frame: PanelFrame) -> _Pictures:
@@ -202,7 +208,7 @@ class ProcessorPainter:
             size_px = frame.flat.shape[2], frame.flat.shape[1]
             turned = self._prepared(frame.flat, self._flat_memory, border_px=0)[0]
             pictures = tuple(map(_registered, turned, self._mountings, self._mounts, [size_px] * len(turned)))
-            self._flat = _Pictures(frame.flat_version, size_px, 0, pictures, tuple(map(_whole, pictures)))
+            self._flat = _Pictures(frame.flat_version, pictures)
         return self._flat
 
     def _prepared(
@@ -224,7 +230,7 @@ class ProcessorPainter:
         return pictures, tuple(boxes)
 
     def _shown(
-        self, panel: int, draw: PanelDraw, solved: _Pictures | None, flat: _Pictures | None, *, is_moved: bool
+        self, panel: int, draw: PanelDraw, solved: _Solution | None, flat: _Pictures | None, *, is_moved: bool
     ) -> tuple[object, ShownPanel]:
         """Return a key that identifies the panel's picture, and the arguments that draw it."""
         screen, curve = self._screens[panel], self._curves[panel]
@@ -256,14 +262,13 @@ class ProcessorPainter:
             shown.relief, (shown.relief_rows, shown.relief_columns) = relief.ctypes.data, relief.shape
             shown.relief_from_screen, shown.push = ScaleShift(*maps[1]), ScaleShift(*maps[2])
         if flat is None:
-            if is_moved and draw.size_px[0] >= COARSE * draw.solved_px[0]:
-                shown.every = 2
+            shown.every += is_moved and draw.size_px[0] >= COARSE * draw.solved_px[0]
             return (solved.version, *maps), shown
         other = flat.pictures[panel]
         shown.flat, shown.flat_stride, shown.flatness = other.ctypes.data, other.strides[0], draw.flatness
         return (solved.version, *maps, flat.version, draw.flatness), shown
 
-    def _maps(self, panel: int, draw: PanelDraw, solved: _Pictures) -> list[tuple[float, float, float, float]]:
+    def _maps(self, panel: int, draw: PanelDraw, solved: _Solution) -> list[tuple[float, float, float, float]]:
         """Return a record's maps (scale_u, scale_v, shift_u, shift_v) for the turned layer's pixels. The first leads to
         positions in the source. If the content's relief displaces them, two follow: to positions in the relief, and to
         the displacement by a relief of 1. Positions count from the centre of a picture's top left pixel.

@@ -41,5 +41,6 @@ def open_panels(settings: OutputSettings, stack: PanelStack, clock: Clock, conte
     if settings.kind != "offscreen":
         from runtime.panels.window import WindowPanels
 
-        return WindowPanels(panel_settings(settings, stack.count), stack, clock, context)
+        layer_px = stack.width_px, stack.height_px
+        return WindowPanels(panel_settings(settings, stack.count), layer_px, clock, context)
     return OffscreenPanels(clock)

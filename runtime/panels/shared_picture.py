@@ -17,7 +17,7 @@ from runtime.optics.rect import PixelRect
 from runtime.panels import xlib
 from runtime.records import U8
 
-PRIVATE, CREATE, OWNER_ONLY, REMOVE = 0, 0o1000, 0o600, 0  # arguments of shmget and shmctl
+PRIVATE, OWNER_ONLY, REMOVE = 0, 0o600, 0  # arguments of shmget and shmctl
 Z_PIXMAP, ALL_PLANES = 2, 0xFFFFFFFF
 # The picture's first byte in its segment. On an AMD Zen 3 processor, the X server's copy takes 1.5 times as long if
 # the rows' addresses are just below their destinations modulo 4 KiB, as with a picture at the start of a page.
@@ -116,14 +116,15 @@ class SharedPicture:
         image = self._image.contents
         part = part or PixelRect(0, 0, image.width, image.height)
         at, size = (part.u0, part.v0), (part.width_px, part.height_px)
-        _short_calls()[1].XShmPutImage(self._display, self._window, self._context, self._image, *at, *at, *size, 0)
+        _, extensions = _short_calls()
+        extensions.XShmPutImage(self._display, self._window, self._context, self._image, *at, *at, *size, 0)
 
     def close(self) -> None:
         """Release the memory. May be called more than once. `pixels` must not be used afterwards."""
         x11, extensions, system = _libraries()
         if self._attached:
             extensions.XShmDetach(self._display, byref(self._segment))
-            x11.XSync(self._display, 0)
+            finish(self._display)
         if self._context:
             x11.XFreeGC(self._display, self._context)
         if self._image:
@@ -149,7 +150,7 @@ class SharedPicture:
         masks = visual.contents.red_mask, visual.contents.green_mask, visual.contents.blue_mask
         if image.pixel_bits != 32 or image.stride != 4 * width_px or masks != (0xFF0000, 0xFF00, 0xFF):
             raise NotShared("the X server's pixels are not 32-bit BGRX")
-        self._segment.id = system.shmget(PRIVATE, FIRST_BYTE + image.stride * height_px, CREATE | OWNER_ONLY)
+        self._segment.id = system.shmget(PRIVATE, FIRST_BYTE + image.stride * height_px, OWNER_ONLY)
         if self._segment.id < 0:
             raise NotShared(f"no shared memory: {os.strerror(ctypes.get_errno())}")
         address = system.shmat(self._segment.id, None, 0)
@@ -157,10 +158,10 @@ class SharedPicture:
             system.shmctl(self._segment.id, REMOVE, None)
             raise NotShared(f"no shared memory: {os.strerror(ctypes.get_errno())}")
         self._segment.address, image.data = address, address + FIRST_BYTE
-        x11.XSync(self._display, 0)  # so that only this request is counted
+        finish(self._display)  # so that only this request is counted
         refused = xlib.refusals()
         self._attached = bool(extensions.XShmAttach(self._display, byref(self._segment)))
-        x11.XSync(self._display, 0)
+        finish(self._display)
         system.shmctl(self._segment.id, REMOVE, None)  # takes effect once the server and this process have let go
         if not self._attached or xlib.refusals() != refused:
             self._attached = False
@@ -176,11 +177,12 @@ class SharedPicture:
         """Return the first pixel as the X server finds it, after setting it to a random value. A server in another IPC
         namespace may have attached a different segment, which has the same number there.
         """
-        depth = self._image.contents.depth
+        depth, at, size = self._image.contents.depth, (0, 0), (1, 1)
         ctypes.c_uint32.from_address(self._image.contents.data).value = int.from_bytes(os.urandom(3), "little")
-        pixmap = x11.XCreatePixmap(self._display, self._window, 1, 1, depth)
-        _short_calls()[1].XShmPutImage(self._display, pixmap, self._context, self._image, 0, 0, 0, 0, 1, 1, 0)
-        copy = x11.XGetImage(self._display, pixmap, 0, 0, 1, 1, ALL_PLANES, Z_PIXMAP)
+        pixmap = x11.XCreatePixmap(self._display, self._window, *size, depth)
+        _, extensions = _short_calls()
+        extensions.XShmPutImage(self._display, pixmap, self._context, self._image, *at, *at, *size, 0)
+        copy = x11.XGetImage(self._display, pixmap, *at, *size, ALL_PLANES, Z_PIXMAP)
         x11.XFreePixmap(self._display, pixmap)
         if not copy:
             return None
@@ -191,9 +193,11 @@ class SharedPicture:
 
 def finish(display: int) -> None:
     """Wait until the X server has carried out every request."""
-    _libraries()[0].XSync(display, 0)
+    x11, _, _ = _libraries()
+    x11.XSync(display, 0)
 
 
 def flush(display: int) -> None:
     """Send all requests to the X server without waiting for them."""
-    _short_calls()[0].XFlush(display)
+    x11, _ = _short_calls()
+    x11.XFlush(display)

@@ -10,7 +10,6 @@ import moderngl
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock, MonotonicClock
 from runtime.config import PanelSettings
 from runtime.errors import PanelLost
-from runtime.optics.stack import PanelStack
 from runtime.panels.base import PanelSink
 from runtime.panels.card import identity_card
 from runtime.panels.display import Display, connected_monitors, glfw
@@ -45,7 +44,7 @@ class WindowPanels(PanelSink):
     name = "windows"
 
     def __init__(
-        self, panels: tuple[PanelSettings, ...], stack: PanelStack, clock: Clock, context: moderngl.Context, *,
+        self, panels: tuple[PanelSettings, ...], layer_px: tuple[int, int], clock: Clock, context: moderngl.Context, *,
         any_shape: bool = False, on_processor: bool | None = None,
     ) -> None:  # fmt: skip
         """Open a window for each panel, on monitors of any resolution (for `identify`) if `any_shape`. `on_processor`
@@ -53,16 +52,17 @@ class WindowPanels(PanelSink):
         be temporary, and MissingPart if GLFW does not use X11.
         """
         self._any_shape, self._on_processor = any_shape, on_processor
-        self._panels, self._stack = panels, stack
+        self._panels, self._layer_px = panels, layer_px
         self._clock, self._context = clock, context
         self._display: Display | None = None
-        self._windows: PanelWindows | None = None
-        self._watch: PlacementWatch | None = None
-        self._retry_ns, self._lost = 0, ""
-        self._shown = False  # True while the previous frame is on the windows
-        self._away = False  # True if a context other than `context` may be current
+        self._windows: PanelWindows | None
+        self._watch: PlacementWatch | None
+        self._shown: bool  # True while the previous frame is on the windows
+        self._away: bool  # True if a context other than `context` may be current
+        self._lost = ""
         self._context_lost = False
         self.monitors: tuple[Monitor, ...] = ()
+        self._forget()
         try:
             self._open()
         except BaseException:
@@ -74,7 +74,7 @@ class WindowPanels(PanelSink):
     @property
     def period_ns(self) -> int | None:
         """Refresh period of the first panel's monitor, whose blanks pace the swaps, or None if unknown."""
-        refresh_hz = self.monitors[0].refresh_hz if self.monitors else 0.0
+        refresh_hz = self.monitors[0].refresh_hz
         return round(NS_PER_S / refresh_hz) if refresh_hz else None
 
     @property
@@ -138,16 +138,16 @@ class WindowPanels(PanelSink):
         self._away = True
         self._display = display = self._display or Display()
         self.monitors = bind(self._panels, display.monitors())
-        layer_px = self._stack.width_px, self._stack.height_px
         if not self._any_shape:
-            check_modes(self._panels, self.monitors, width_px=layer_px[0], height_px=layer_px[1])
+            check_modes(self._panels, self.monitors, width_px=self._layer_px[0], height_px=self._layer_px[1])
         if difference := refresh_difference(self.monitors):
             log.warning("%s", difference)
         if changed := gamma_warning(self.monitors):
             log.warning("%s", changed)
         self._windows = windows = open_windows(
-            display, self._panels, self.monitors, layer_px=layer_px, clock=self._clock, on_processor=self._on_processor
-        )
+            display, self._panels, self.monitors,
+            layer_px=self._layer_px, clock=self._clock, on_processor=self._on_processor,
+        )  # fmt: skip
         glfw.poll_events()
         self._watch = PlacementWatch(display, self.monitors, windows.windows, self._clock)
 
@@ -165,7 +165,6 @@ class WindowPanels(PanelSink):
         try:
             if self._windows is not None:
                 self._windows.release()
-            display.root.make_current()
             display.close_windows()
         except Exception:
             log.exception("error while closing the windows")
@@ -206,9 +205,7 @@ def every_monitor() -> tuple[WindowPanels, list[U8], tuple[Monitor, ...]]:
     monitors = connected_monitors()
     width, height = max(m.width_px for m in monitors), max(m.height_px for m in monitors)
     bound = tuple(PanelSettings(connector=monitor.connector) for monitor in monitors)
-    # The dimensions do not matter, because each card fills its monitor, of any shape.
-    stack = PanelStack(1.0, 1.0, tuple(0.01 * index for index in range(len(monitors))), width, height)
-    panels = WindowPanels(bound, stack, MonotonicClock(), offscreen_context(), any_shape=True)
+    panels = WindowPanels(bound, (width, height), MonotonicClock(), offscreen_context(), any_shape=True)
     cards = []
     for monitor in monitors:
         lines = [monitor.model or "(the EDID has no name)", f"{monitor.width_px} x {monitor.height_px}",

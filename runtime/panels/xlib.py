@@ -14,13 +14,14 @@ import select
 import threading
 from ctypes import POINTER, byref, c_char_p, c_int, c_long, c_ubyte, c_uint, c_ulong, c_void_p
 from dataclasses import dataclass
+from typing import NoReturn
 
 from runtime.panels.monitors import Rectangle
 
 log = logging.getLogger("phasestack.panels")
 
-ErrorHandler = ctypes.CFUNCTYPE(c_int, c_void_p, c_void_p)
-IOErrorHandler = ctypes.CFUNCTYPE(c_int, c_void_p)
+ErrorHandler = ctypes.CFUNCTYPE(None, c_void_p, c_void_p)  # Xlib ignores what handlers return
+IOErrorHandler = ctypes.CFUNCTYPE(None, c_void_p)
 SERVER_DIED = 75  # EX_TEMPFAIL of sysexits.h
 
 
@@ -118,14 +119,13 @@ def refusals() -> int:
     return _refused
 
 
-def _note_error(_display: int, _event: int) -> int:
+def _note_error(_display: int, _event: int) -> None:
     global _refused
     _refused += 1
     log.warning("the X server refused a request")
-    return 0
 
 
-def _end(_display: int = 0) -> int:
+def _end(*_display: int) -> NoReturn:
     log.critical("the X server died; exiting with status %d for a restart", SERVER_DIED)
     for handler in (*logging.getLogger("phasestack").handlers, *logging.getLogger().handlers):
         handler.flush()
@@ -142,7 +142,7 @@ def take_over_errors() -> None:
     been unplugged, this is only logged and counted. If the X server dies, the process logs a message and ends
     immediately, because Xlib, EGL and GLFW would hang or crash even when asked to release objects.
     """
-    x11 = _libraries()[0]
+    x11, _ = _libraries()
     x11.XSetErrorHandler(_ERROR_HANDLER)
     x11.XSetIOErrorHandler(_IO_ERROR_HANDLER)
 
@@ -154,7 +154,7 @@ class ServerWatch:
 
     def __init__(self, display: int) -> None:
         """Watch a connection, given its open Xlib `Display`, on a new thread. Call `stop` before closing it."""
-        x11 = _libraries()[0]
+        x11, _ = _libraries()
         x11.XConnectionNumber.argtypes = [c_void_p]
         self._connection: int = x11.XConnectionNumber(display)
         self._stop_reading, self._stop_writing = os.pipe()
@@ -185,7 +185,7 @@ def output_state(display: int, output: int) -> OutputState | None:
         return None
     try:
         info = randr.XRRGetOutputInfo(display, resources, output)
-        crtc = info.contents.crtc if info else 0
+        crtc = info.contents.crtc if info else None
         if info:
             randr.XRRFreeOutputInfo(info)
         state = randr.XRRGetCrtcInfo(display, resources, crtc) if crtc else None

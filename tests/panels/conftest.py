@@ -8,9 +8,8 @@ from typing import Any
 import moderngl
 import pytest
 
-from runtime.clock import MonotonicClock
+from runtime.clock import Clock, MonotonicClock
 from runtime.config import PanelSettings
-from runtime.optics.stack import PanelStack
 from runtime.panels.window import WindowPanels
 from runtime.support.gl import offscreen_context
 from tests.panels import xserver
@@ -57,9 +56,9 @@ def opened(x: xserver.XServer, gl: moderngl.Context, drawn_by: str) -> Iterator[
     """Opens windows that are closed at the end."""
     sinks = []
 
-    def open_(*panels: PanelSettings) -> Any:
-        stack = PanelStack(0.5, 0.28, (-0.06, 0.0, 0.06), xserver.WIDTH_PX, xserver.HEIGHT_PX)
-        sinks.append(WindowPanels(panels, stack, MonotonicClock(), gl, on_processor=drawn_by == "processor"))
+    def open_(*panels: PanelSettings, clock: Clock | None = None) -> Any:
+        layer_px, on_processor = (xserver.WIDTH_PX, xserver.HEIGHT_PX), drawn_by == "processor"
+        sinks.append(WindowPanels(panels, layer_px, clock or MonotonicClock(), gl, on_processor=on_processor))
         return sinks[-1]
 
     yield open_

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import moderngl
 import numpy as np
 
-from runtime.clock import Clock
+from runtime.clock import Clock, SimulatedClock
 from runtime.config import PanelSettings
 from runtime.optics.presentation import panel_draws
 from runtime.optics.rect import PixelRect
@@ -14,9 +16,20 @@ from runtime.panels.processor import Mounting, ProcessorPainter
 from runtime.panels.registry import OffscreenPanels
 from runtime.records import U8, PanelFrame, PresentReport
 
+Size = tuple[int, int]
+
 
 class ReadPanels(OffscreenPanels):
     """Offscreen panels whose last frame can be read back."""
+
+    def __init__(
+        self, *, clock: Clock, size_px: Size, panels: tuple[PanelSettings, ...], screen_px: Size | None = None
+    ) -> None:
+        super().__init__(clock)
+        self._settings = panels
+        sizes = [screen_px or (size_px[::-1] if one.rotation_deg in (90, 270) else size_px) for one in panels]
+        self._how = [{"screen_px": screen, "layer_px": size_px} for screen in sizes]
+        self._mounts = [mount_of(one, **how) for one, how in zip(panels, self._how, strict=True)]
 
     def present(self, frame: PanelFrame, *, unchanged: bool = False, due_ns: int | None = None) -> PresentReport:
         self._frame = frame
@@ -30,26 +43,16 @@ class ReadPanels(OffscreenPanels):
 class DrawnPanels(ReadPanels):
     """Offscreen panels whose `read_back` uploads missing layers and draws."""
 
-    def __init__(
-        self,
-        context: moderngl.Context,
-        *,
-        clock: Clock,
-        size_px: tuple[int, int],
-        panels: tuple[PanelSettings, ...],
-        screen_px: tuple[int, int] | None = None,
-    ) -> None:
-        super().__init__(clock)
-        self._textures = FrameTextures(context, count=len(panels))
+    def __init__(self, context: moderngl.Context, **panels: Any) -> None:
+        super().__init__(**panels)
+        self._textures = FrameTextures(context, count=len(self._mounts))
         self._context = context
         self._painters: list[Painter] = []
         self._targets: list[moderngl.Framebuffer] = []
-        for settings in panels:
-            screen = screen_px or (size_px[::-1] if settings.rotation_deg in (90, 270) else size_px)
-            alike = [painter for painter, other in zip(self._painters, panels, strict=False) if other == settings]
-            mount = mount_of(settings, screen_px=screen, layer_px=size_px)
+        for settings, mount in zip(self._settings, self._mounts, strict=True):
+            alike = [one for one, other in zip(self._painters, self._settings, strict=False) if other == settings]
             self._painters.append(alike[0] if alike else Painter(context, mount))  # compiling shaders is slow
-            self._targets.append(context.framebuffer([context.texture(screen, 4)]))
+            self._targets.append(context.framebuffer([context.texture(mount.screen_px, 4)]))
 
     def read_back(self) -> tuple[U8, ...]:
         pictures = []
@@ -82,16 +85,11 @@ class DrawnPanels(ReadPanels):
 class ProcessorDrawnPanels(ReadPanels):
     """Offscreen panels drawn on the processor."""
 
-    def __init__(self, *, clock: Clock, size_px: tuple[int, int], panels: tuple[PanelSettings, ...]) -> None:
-        super().__init__(clock)
-        self._screens, mountings, mounts = [], [], []
-        for settings in panels:
-            screen = size_px[::-1] if settings.rotation_deg in (90, 270) else size_px
-            mounting = Mounting.of(settings, screen_px=screen, layer_px=size_px)
-            mountings.append(mounting)
-            mounts.append(mount_of(settings, screen_px=screen, layer_px=size_px))
-            self._screens.append(np.zeros((*screen[::-1], 4), np.uint8))
-        self._painter = ProcessorPainter(mounts, mountings, self._screens)
+    def __init__(self, **panels: Any) -> None:
+        super().__init__(**panels)
+        mountings = [Mounting.of(one, **how) for one, how in zip(self._settings, self._how, strict=True)]
+        self._screens = [np.zeros((*mount.screen_px[::-1], 4), np.uint8) for mount in self._mounts]
+        self._painter = ProcessorPainter(self._mounts, mountings, self._screens)
 
     def drawn(self, frame: PanelFrame) -> dict[int, PixelRect]:
         """The part of each panel's picture that a frame changes, by the panel's number."""
@@ -100,3 +98,9 @@ class ProcessorDrawnPanels(ReadPanels):
     def read_back(self) -> tuple[U8, ...]:
         self._painter.draw(self._frame)
         return tuple(screen[..., [2, 1, 0, 3]] for screen in self._screens)
+
+
+def drawn_panels(context: moderngl.Context | None, size_px: Size, *panels: PanelSettings, **how: Any) -> Any:
+    """Panels that the shader draws, or without a context the processor."""
+    told = {"clock": SimulatedClock(), "size_px": size_px, "panels": panels, **how}
+    return ProcessorDrawnPanels(**told) if context is None else DrawnPanels(context, **told)

@@ -54,9 +54,9 @@ class Row:
         layer_px = self.stack.width_px, self.stack.height_px
         return tuple(mount_of(panel, screen_px=self.screen_px, layer_px=layer_px) for panel in self.panels)
 
-    def reference(self, between: Interpolation) -> U8:
-        """(N, h, w, 3) what the monitors show."""
-        frame = self.frame()
+    def reference(self, between: Interpolation, frame: PanelFrame | None = None) -> U8:
+        """(N, h, w, 3) what the monitors show, by default of the row's own frame."""
+        frame = frame or self.frame()
         assert frame.solved is not None and frame.flat is not None
         draws = panel_draws(frame, self.mounts(), between=between)
         pictures = [shown_picture(*one) for one in zip(draws, frame.solved, frame.flat, strict=True)]

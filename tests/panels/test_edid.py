@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -11,15 +12,17 @@ from runtime.panels.edid import parse
 from tests.panels.edids import block
 
 
-def test_maker_model_and_serial_are_read() -> None:
-    edid = parse(block(serial_text="A1B2-0003"))
-    assert (edid.maker, edid.name, edid.serial) == ("EIZ", "CG2700X", "A1B2-0003")
+@pytest.mark.parametrize("serial", ["A1B2-0003", "0123456789ABC"])
+def test_maker_model_and_serial_are_read_from_any_descriptor(serial: str) -> None:
+    data = block(serial_text=serial)
+    for start in (54, 72, 90, 108):
+        edid = parse(data[:54] + data[start:126] + data[54:start] + data[126:])
+        assert (edid.maker, edid.name, edid.serial) == ("EIZ", "CG2700X", serial)
 
 
 def test_a_serial_number_is_text_unless_it_means_none() -> None:
-    assert parse(block(serial_number=1234)).serial == "1234"
-    assert parse(block(serial_number=0)).serial == ""
-    assert parse(block(serial_number=0x01010101)).serial == ""
+    numbers = (1234, 0, 0x01010101)
+    assert [parse(block(serial_number=number)).serial for number in numbers] == ["1234", "", ""]
 
 
 def test_text_padded_with_zeros_ends_at_the_first() -> None:

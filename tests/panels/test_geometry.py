@@ -47,29 +47,36 @@ def test_an_ideal_pixel_is_drawn_where_registration_found_it(
 
 
 def test_layers_of_half_the_resolution_fill_the_panel() -> None:
-    matrix = layer_from_screen(
-        screen_width_px=1920, screen_height_px=1080, layer_width_px=960, layer_height_px=540,
-        rotation_deg=0, mirror="none", homography=np.eye(3),
-    )  # fmt: skip
+    sizes = {"screen_width_px": 1920, "screen_height_px": 1080, "layer_width_px": 960, "layer_height_px": 540}
+    matrix = layer_from_screen(**sizes, rotation_deg=0, mirror="none", homography=np.eye(3))
     assert apply(matrix, 1920, 1080) == pytest.approx((960, 540))
     assert not permutes_pixels(matrix)
 
 
-def test_a_shift_by_a_whole_pixel_is_a_permutation_by_half_not() -> None:
-    assert not permutes_pixels(np.array([[1, 0, 0.5], [0, 1, 0], [0, 0, 1.0]]))
-    assert permutes_pixels(np.array([[1, 0, 1.0], [0, 1, 0], [0, 0, 1.0]]))
-
-
-def test_a_singular_homography_is_refused() -> None:
-    with pytest.raises(ValueError, match="invertible"):
-        layer_from_screen(
-            screen_width_px=16, screen_height_px=16, layer_width_px=16, layer_height_px=16,
-            rotation_deg=0, mirror="none", homography=((1, 0, 0), (2, 0, 0), (0, 0, 1)),
-        )  # fmt: skip
-
-
-@pytest.mark.parametrize("place", [(2, 0), (2, 1)])
-def test_a_perspective_registration_is_no_permutation_however_weak(place: tuple[int, int]) -> None:
+@pytest.mark.parametrize(
+    ("entries", "permutes"),
+    [
+        ({(0, 2): 1.0}, True),
+        ({(0, 2): -1e-12, (1, 2): 1e-12}, True),  # as rounding leaves them
+        *(({(row, 2): shift}, False) for row in (0, 1) for shift in (0.5, 1.5, 1.5e-9, -1.5e-9)),
+        *(({(0, 0): scale, (1, 1): 1.0}, False) for scale in (0.5, 2.0, 0.0)),
+        *(({place: 1.5e-12}, False) for place in ((0, 1), (1, 0))),
+        *(({(2, column): weak}, False) for column in (0, 1) for weak in (1e-12, 1e-15)),
+        ({(2, 2): 0.0}, False),
+    ],
+)
+def test_only_turns_and_shifts_by_whole_pixels_are_permutations(entries: Any, permutes: bool) -> None:
     matrix = np.eye(3)
-    matrix[place] = 1e-12
-    assert not permutes_pixels(matrix)
+    for place, value in entries.items():
+        matrix[place] = value
+    assert permutes_pixels(matrix) == permutes
+
+
+@pytest.mark.parametrize(
+    "homography", [((1, 0, 0), (2, 0, 0), (0, 0, 1)), np.diag([1, np.nan, 1]), np.diag([1, 1, 9e-13])]
+)
+def test_a_singular_homography_is_refused(homography: Any) -> None:
+    common = {"screen_width_px": 16, "screen_height_px": 16, "layer_width_px": 16, "layer_height_px": 16}
+    with pytest.raises(ValueError, match="invertible"):
+        layer_from_screen(**common, rotation_deg=0, mirror="none", homography=homography)
+    layer_from_screen(**common, rotation_deg=0, mirror="none", homography=np.diag([1, 1, 1e-12]))

@@ -11,25 +11,16 @@ from runtime.errors import InputError
 from runtime.panels.lut import curve, measured_curve
 
 
-def test_without_a_curve_the_grey_is_the_phase() -> None:
-    assert np.array_equal(np.rint(curve(lut="", gamma=1.0) * 255), np.repeat(np.arange(256)[:, None], 3, axis=1))
+@pytest.mark.parametrize("gamma", [1.0, 2.2])
+def test_a_gamma_undoes_the_panels_own(gamma: float) -> None:
+    grey = curve(lut="", gamma=gamma)
+    assert grey.shape == (256, 3) and np.allclose(grey**gamma, np.linspace(0, 1, 256)[:, None], atol=1e-6)
 
 
-def test_a_gamma_undoes_the_panels_own() -> None:
-    grey = curve(lut="", gamma=2.2)
-    assert np.allclose(grey[:, 0] ** 2.2, np.linspace(0, 1, 256), atol=1e-6)
-
-
-def test_a_measured_curve_is_read_per_channel_and_interpolated(tmp_path: Path) -> None:
+def test_a_measured_curve_is_interpolated_per_channel_or_serves_all(tmp_path: Path) -> None:
     path = tmp_path / "curve.csv"
     path.write_text("phase,red,green,blue\n0,0,0,0\n0.5,0.25,0.5,0.75\n1,1,1,1\n")
-    grey = curve(lut=str(path), gamma=1.0)
-    quarter = grey[64]
-    assert quarter == pytest.approx(np.array([0.5, 1.0, 1.5]) * 64 / 255, abs=1e-6)
-
-
-def test_one_grey_column_serves_all_channels(tmp_path: Path) -> None:
-    path = tmp_path / "curve.csv"
+    assert curve(lut=str(path), gamma=1.0)[64] == pytest.approx(np.array([0.5, 1.0, 1.5]) * 64 / 255, abs=1e-6)
     path.write_text("# measured\nphase,grey\n0,0.1\n1,0.9\n")
     assert curve(lut=str(path), gamma=1.0)[[0, 255]] == pytest.approx(np.array([[0.1] * 3, [0.9] * 3]))
 
@@ -62,6 +53,7 @@ def test_a_wrong_curve_is_refused_by_file_and_field(tmp_path: Path, text: str, f
     "text",
     [
         "phase;grey\n0;0\n0,5;0,25\n1;1\n",
+        "phase,grey\n\n0,0\n0.5,0.25\n1,1\n",
         "phase\tgrey\n0\t0\n0,5\t0,25\n1\t1\n",
         "sep=;\nphase;grey\n# measured; by hand\n0;0\n0,5;0,25\n1;1\n",
         "\ufeffphase;grey\n0;0\n0.5;0.25\n1;1\n",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import moderngl
@@ -14,18 +15,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from runtime.clock import SimulatedClock
 from runtime.config import PanelSettings
 from runtime.optics.alignment import align
 from runtime.optics.presentation import shown_layers
 from runtime.optics.stack import PanelStack
-from runtime.panels.presentation import mount_of
-from runtime.panels.processor import Mounting, ProcessorPainter
 from runtime.records import U8, PanelFrame, PresentReport
-from tests.panels.drawn import DrawnPanels, ProcessorDrawnPanels, ReadPanels
+from tests.panels.drawn import DrawnPanels, ReadPanels, drawn_panels
 
 WIDTH, HEIGHT = 48, 32
-TINY = PanelStack(0.5, 0.3, (-0.1, 0.0, 0.1), WIDTH, HEIGHT)
 
 
 @pytest.fixture
@@ -45,17 +42,10 @@ def context(request: pytest.FixtureRequest) -> moderngl.Context | None:
     return made
 
 
-def offscreen(context: moderngl.Context | None, stack: PanelStack, *panels: PanelSettings) -> ReadPanels:
-    size_px = stack.width_px, stack.height_px
-    if context is None:
-        return ProcessorDrawnPanels(clock=SimulatedClock(), size_px=size_px, panels=panels)
-    return DrawnPanels(context, clock=SimulatedClock(), size_px=size_px, panels=panels)
-
-
 def shown(
-    context: moderngl.Context | None, layers: NDArray[np.uint8], *panels: PanelSettings
+    context: moderngl.Context | None, layers: NDArray[np.uint8], *panels: PanelSettings, **how: Any
 ) -> list[NDArray[np.uint8]]:
-    sink = offscreen(context, TINY, *panels)
+    sink = drawn_panels(context, (WIDTH, HEIGHT), *panels, **how)
     try:
         sink.present(PanelFrame(1, layers, 1))
         return [picture[..., :3] for picture in sink.read_back()]
@@ -64,19 +54,14 @@ def shown(
 
 
 @BOTH
-@pytest.mark.parametrize(("rotation_deg", "clockwise_quarters"), [(0, 0), (90, 1), (180, 2), (270, 3)])
+@pytest.mark.parametrize("rotation_deg", [0, 90, 180, 270])
 @pytest.mark.parametrize(("mirror", "axis"), [("none", None), ("horizontal", 1), ("vertical", 0)])
 def test_a_mounted_panel_s_picture_is_mirrored_then_turned(
-    context: moderngl.Context | None,
-    layers: NDArray[np.uint8],
-    rotation_deg: int,
-    clockwise_quarters: int,
-    mirror: str,
-    axis: int | None,
+    context: moderngl.Context | None, layers: NDArray[np.uint8], rotation_deg: int, mirror: str, axis: int | None
 ) -> None:
     (picture,) = shown(context, layers[:1], PanelSettings(rotation_deg=rotation_deg, mirror=mirror))
     seen = layers[0, ..., :3] if axis is None else np.flip(layers[0, ..., :3], axis)
-    assert np.array_equal(picture, np.rot90(seen, -clockwise_quarters))
+    assert np.array_equal(picture, np.rot90(seen, -rotation_deg // 90))
 
 
 @BOTH
@@ -104,15 +89,19 @@ def test_a_perspective_registration_agrees_with_an_independent_warp(context: mod
 
 
 @BOTH
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_horizon_just_beyond_the_panel_darkens_nothing(
-    context: moderngl.Context | None, layers: NDArray[np.uint8], sign: float
+@pytest.mark.parametrize(
+    ("sign", "diagonal", "axis", "at", "lit"),
+    [(sign, 1, axis, 1.5, np.s_[: HEIGHT // 3, : WIDTH // (3 - axis)]) for sign in (1, -1) for axis in (0, 1)]  # beyond
+    + [(1, -1, 0, 0.35, np.s_[:8, -8:]), (1, -1, 1, 0.35, np.s_[-8:, :8])],  # across it
+)
+def test_with_a_horizon_the_side_of_the_panel_s_middle_is_seen(
+    context: moderngl.Context | None, layers: U8, sign: int, diagonal: int, axis: int, at: float, lit: Any
 ) -> None:
-    """Below the picture, but nearer than twice its height: what counts is the panel's middle."""
-    bent = sign * np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 1 / (1.5 * HEIGHT), 1.0]])
-    settings = PanelSettings(homography=tuple(map(tuple, bent.tolist())))
+    seen = sign * np.diag([diagonal, diagonal, 1.0])
+    seen[2, axis] = -sign / (at * (WIDTH, HEIGHT)[axis])
+    settings = PanelSettings(homography=tuple(map(tuple, np.linalg.inv(seen).tolist())))
     (picture,) = shown(context, np.full_like(layers[:1], 200), settings)
-    assert (picture[: HEIGHT // 3, : WIDTH // 2] == 200).all()
+    assert (picture[lit] == 200).all() if diagonal > 0 else (picture[lit] >= 190).all() and not picture[:4, :4].any()
 
 
 @BOTH
@@ -129,7 +118,7 @@ def test_each_channel_goes_through_its_own_curve(context: moderngl.Context | Non
 
 # A solution that is aligned to where the eyes are now.
 
-STACK = PanelStack(0.5184, 0.3456, (-0.1, 0.0, 0.06), 480, 320)
+STACK, SIZE_PX = PanelStack(0.5184, 0.3456, (-0.1, 0.0, 0.06), 480, 320), (480, 320)
 HEAD = np.array([[0.6, -0.031, 0.0], [0.6, 0.031, 0.0]])
 
 
@@ -144,7 +133,7 @@ def smooth(seed: int) -> np.ndarray:
 
 @pytest.fixture
 def sink(context: moderngl.Context | None) -> Iterator[ReadPanels]:
-    made = offscreen(context, STACK, *(PanelSettings(),) * STACK.count)
+    made = drawn_panels(context, SIZE_PX, *(PanelSettings(),) * 3)
     yield made
     made.close()
 
@@ -164,7 +153,7 @@ def test_an_unaligned_panel_is_exact_to_the_bit_beside_aligned_ones(sink: ReadPa
 @BOTH
 def test_a_registered_panel_is_aligned_first_then_warped_by_its_registration(context: moderngl.Context | None) -> None:
     shift = PanelSettings(homography=((1.0, 0.0, 5.0), (0.0, 1.0, -3.0), (0.0, 0.0, 1.0)))
-    sink = offscreen(context, STACK, *(shift,) * 3)
+    sink = drawn_panels(context, SIZE_PX, *(shift,) * 3)
     matrices = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([0.02, 0.016, 0.03])).solved_from_shown
     frame = PanelFrame(1, smooth(1), 1, matrices)
     sink.present(frame)
@@ -191,7 +180,7 @@ def test_a_solution_is_uploaded_once_however_often_it_is_aligned_and_shown(
         matrices = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + 0.001 * number).solved_from_shown
         sink.present(PanelFrame(number, solved, 3, matrices, flat, 5, 0.25 * number))
         sink.read_back()
-    assert [id(layers) for layers in written] == [id(solved), id(flat)]
+        assert [id(layers) for layers in written] == [id(solved), id(flat)][: number + 1]
     sink.present(PanelFrame(5, smooth(3), 4, (), flat, 5, 0.0))
     other = smooth(4)
     sink.present(PanelFrame(6, smooth(3), 4, (), other, 6, 1.0))  # the solution isn't seen, the flat picture is
@@ -210,9 +199,9 @@ def test_a_new_solution_is_recognised_by_its_version_alone(sink: ReadPanels) -> 
 def test_monitors_show_each_panel_aligned_for_its_own_display_time(sink: ReadPanels) -> None:
     relief = np.asarray(0.15 * np.sin(np.mgrid[0:27, 0:48][1] / 8), np.float32)
     own = [align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([0, move_m, 0])) for move_m in (0.004, 0.008, 0.016)]
-    size_px, layers = (STACK.width_px, STACK.height_px), smooth(1)
+    layers = smooth(1)
     now, *_ = frames = [
-        PanelFrame(1, layers, 1, each.solved_from_shown, size_px=size_px, relief=relief, parallax=each.parallax)
+        PanelFrame(1, layers, 1, each.solved_from_shown, size_px=SIZE_PX, relief=relief, parallax=each.parallax)
         for each in own
     ]
     in_turn = tuple((each.solved_from_shown[n], each.parallax) for n, each in enumerate(own))
@@ -225,7 +214,7 @@ def test_monitors_show_each_panel_aligned_for_its_own_display_time(sink: ReadPan
 @BOTH
 def test_an_even_coarse_solution_reaches_the_panel_s_edge(sink: ReadPanels) -> None:
     even = np.full((3, STACK.height_px // 2, STACK.width_px // 2, 4), 200, np.uint8)
-    sink.present(frame := PanelFrame(1, even, 1, (), size_px=(STACK.width_px, STACK.height_px)))
+    sink.present(frame := PanelFrame(1, even, 1, (), size_px=SIZE_PX))
     assert (shown_layers(frame)[..., :3] == 200).all()
     assert (codes(sink.read_back()) == 200).all()
 
@@ -241,12 +230,8 @@ def test_a_mounted_panel_is_aligned_and_displaced_as_the_viewer_sees_it(
     relief = np.asarray(np.maximum(0.1 * np.sin(u) * np.cos(v), 0.0), np.float32)  # flat between the hills
     moved = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([0.02, 0.016, -0.01]))
     layers = np.ascontiguousarray(smooth(1)[:, ::reduction, ::reduction])
-    size_px = STACK.width_px, STACK.height_px
-    frame = PanelFrame(
-        1, layers, 1, moved.solved_from_shown, smooth(2), 1, 0.3, size_px, relief, moved.parallax
-    )  # fmt: skip
-    settings = PanelSettings(rotation_deg=rotation_deg, mirror=mirror)
-    sink = ProcessorDrawnPanels(clock=SimulatedClock(), size_px=size_px, panels=(settings,) * 3)
+    frame = PanelFrame(1, layers, 1, moved.solved_from_shown, smooth(2), 1, 0.3, SIZE_PX, relief, moved.parallax)
+    sink = drawn_panels(None, SIZE_PX, *(PanelSettings(rotation_deg=rotation_deg, mirror=mirror),) * 3)
     sink.present(frame)
     for picture, seen in zip(sink.read_back(), shown_layers(frame), strict=True):
         mirrored = {"none": seen, "horizontal": seen[:, ::-1], "vertical": seen[::-1]}[mirror]
@@ -256,30 +241,15 @@ def test_a_mounted_panel_is_aligned_and_displaced_as_the_viewer_sees_it(
 
 @BOTH
 def test_layers_are_enlarged_for_a_larger_monitor(context: moderngl.Context | None) -> None:
-    size_px, screen_px = (WIDTH, HEIGHT), (2 * WIDTH, 2 * HEIGHT)
+    screen_px = 2 * WIDTH, 2 * HEIGHT
     layer = cv2.GaussianBlur(np.random.default_rng(3).integers(0, 256, (HEIGHT, WIDTH, 4), np.uint8), (0, 0), 4)
-    settings = PanelSettings()
-    if context is None:
-        painter = ProcessorPainter(
-            [mount_of(settings, screen_px=screen_px, layer_px=size_px)],
-            [Mounting.of(settings, screen_px=screen_px, layer_px=size_px)],
-            screens := [np.zeros((*screen_px[::-1], 4), np.uint8)],
-        )  # fmt: skip
-        painter.draw(PanelFrame(1, layer[None], 1))
-        picture = screens[0][..., [2, 1, 0]]
-    else:
-        sink = DrawnPanels(context, clock=SimulatedClock(), size_px=size_px, panels=(settings,), screen_px=screen_px)
-        sink.present(PanelFrame(1, layer[None], 1))
-        picture = sink.read_back()[0][..., :3]
-        sink.close()
+    (picture,) = shown(context, layer[None], PanelSettings(), screen_px=screen_px)
     enlarged = cv2.resize(layer, screen_px, interpolation=cv2.INTER_LINEAR)[..., :3]
     assert np.abs(picture.astype(int) - enlarged)[2:-2, 2:-2].max() <= 2
 
 
 def test_on_the_processor_only_panels_that_change_are_drawn() -> None:
-    sink = ProcessorDrawnPanels(
-        clock=SimulatedClock(), size_px=(STACK.width_px, STACK.height_px), panels=(PanelSettings(),) * 3
-    )
+    sink = drawn_panels(None, SIZE_PX, *(PanelSettings(),) * 3)
     alike, moved = align(STACK, solved_for_m=HEAD, eyes_m=HEAD), align(STACK, solved_for_m=HEAD, eyes_m=HEAD * 1.01)
     layers = smooth(1)
     assert list(sink.drawn(PanelFrame(1, layers, 1, alike.solved_from_shown))) == [0, 1, 2]
@@ -288,45 +258,47 @@ def test_on_the_processor_only_panels_that_change_are_drawn() -> None:
     assert list(sink.drawn(PanelFrame(4, smooth(2), 2, moved.solved_from_shown))) == [0, 1, 2]
 
 
-@pytest.mark.slow
-@given(st.lists(st.sampled_from([1, 2, 3, 4]), min_size=2, max_size=6))
+@pytest.mark.parametrize("reductions", [[1, 2], [3, 2, 4]])
 def test_on_the_processor_nothing_remains_of_an_earlier_raster(reductions: list[int]) -> None:
     """Solutions of all rasters share their memory."""
     moved = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([-0.1, -0.1, 0.05])).solved_from_shown
-    size_px, panels = (STACK.width_px, STACK.height_px), (PanelSettings(rotation_deg=90),) * 3
-
-    def opened() -> ProcessorDrawnPanels:
-        return ProcessorDrawnPanels(clock=SimulatedClock(), size_px=size_px, panels=panels)
-
-    sink = opened()
+    sink, fresh = (drawn_panels(None, SIZE_PX, *(PanelSettings(rotation_deg=90),) * 3) for _ in range(2))
     for version, by in enumerate(reductions, start=1):
         layers = np.ascontiguousarray(smooth(version)[:, ::by, ::by])
-        sink.present(PanelFrame(version, layers, version, moved, size_px=size_px))
+        sink.present(PanelFrame(version, layers, version, moved, size_px=SIZE_PX))
         drawn = sink.read_back()
-    fresh = opened()
-    fresh.present(PanelFrame(version, layers, version, moved, size_px=size_px))
+    fresh.present(PanelFrame(version, layers, version, moved, size_px=SIZE_PX))
     assert np.abs(codes(drawn) - codes(fresh.read_back())).max() <= 1  # parts are rounded otherwise than the whole
 
 
-@pytest.mark.parametrize("size_px", [(480, 320), (477, 319)])
+@pytest.mark.slow
+@given(st.lists(st.sampled_from([1, 2, 3, 4]), min_size=2, max_size=6))
+def test_on_the_processor_nothing_remains_of_any_raster(reductions: list[int]) -> None:
+    test_on_the_processor_nothing_remains_of_an_earlier_raster(reductions)
+
+
+@pytest.mark.parametrize(
+    ("size_px", "solved_px", "averages"),
+    [((480, 320), (120, 80), 1), ((477, 319), (120, 80), 1), ((480, 320), (320, 213), 1), ((477, 319), (320, 213), 0)],
+)
 @pytest.mark.parametrize("gamma", [1.0, 2.0])
 def test_on_the_processor_pixels_between_those_of_a_coarse_solution_are_averages(
-    size_px: tuple[int, int], gamma: float
+    size_px: tuple[int, int], solved_px: tuple[int, int], averages: int, gamma: float
 ) -> None:
     """Every pixel of even rows and columns is sampled as the reference does, whichever thread draws it."""
     width, height = size_px
     stack = PanelStack(0.5184, 0.3456, (-0.1, 0.0, 0.06), width, height)
     moved = align(stack, solved_for_m=HEAD, eyes_m=HEAD + np.array([0.01, 0.016, 0.008]))
     relief = np.full((height // 16, width // 16), 0.1, np.float32)
-    layers = np.ascontiguousarray(smooth(1)[:, ::4, ::4])
+    layers = np.stack([cv2.resize(layer, solved_px, interpolation=cv2.INTER_NEAREST) for layer in smooth(1)])
     frame = PanelFrame(1, layers, 1, moved.solved_from_shown, None, 0, 0.0, size_px, relief, moved.parallax)
-    settings = PanelSettings(gamma=gamma)
-    sink = ProcessorDrawnPanels(clock=SimulatedClock(), size_px=size_px, panels=(settings,) * 3)
+    sink = drawn_panels(None, size_px, *(PanelSettings(gamma=gamma),) * 3)
     sink.present(frame)
     drawn, reference = codes(sink.read_back()), codes(shown_layers(frame)).astype(float)
     expected = reference.copy()
-    expected[:, :, 1:-1:2] = (reference[:, :, 0:-2:2] + reference[:, :, 2::2]) / 2
-    expected[:, 1:-1:2] = (expected[:, 0:-2:2] + expected[:, 2::2]) / 2
+    if averages:
+        expected[:, :, 1:-1:2] = (reference[:, :, 0:-2:2] + reference[:, :, 2::2]) / 2
+        expected[:, 1:-1:2] = (expected[:, 0:-2:2] + expected[:, 2::2]) / 2
     inner = (slice(None), slice(0, height - 1), slice(0, width - 1))  # what lies beyond the last pixel is not shown
     greys = 255 * (expected / 255) ** (1 / gamma)
     near_black = expected < 16  # where the curve is steep

@@ -4,30 +4,26 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import moderngl
 import numpy as np
 import pytest
 
-from runtime.clock import SimulatedClock
 from runtime.config import PanelSettings
+from runtime.optics.malus import rest_code
 from runtime.optics.presentation import Interpolation, panel_draws, shown_layers
 from runtime.panels import processor
 from runtime.records import U8
 from tests.panels import presentation_table as table
-from tests.panels.drawn import DrawnPanels, ProcessorDrawnPanels, ReadPanels
+from tests.panels.drawn import drawn_panels
 
 NAMES = pytest.mark.parametrize("name", table.ROWS)
 
 
 def drawn(row: table.Row, context: moderngl.Context | None) -> U8:
     """(N, h, w, 3) what the shader shows, or without a context the processor."""
-    size_px, panels = (row.stack.width_px, row.stack.height_px), row.panels
-    sink: ReadPanels
-    if context is None:
-        sink = ProcessorDrawnPanels(clock=SimulatedClock(), size_px=size_px, panels=panels)
-    else:
-        sink = DrawnPanels(context, clock=SimulatedClock(), size_px=size_px, panels=panels)
+    sink = drawn_panels(context, (row.stack.width_px, row.stack.height_px), *row.panels)
     sink.present(row.frame())
     found = np.stack(sink.read_back())[..., :3]
     sink.close()
@@ -45,6 +41,24 @@ def test_the_processor_shows_what_the_reference_shows(name: str) -> None:
     if table.ROWS[name].coarser >= processor.COARSE and table.ROWS[name].move_m != table.STILL and "mixed" not in name:
         shown, expected = shown[:, ::2, ::2], expected[:, ::2, ::2]  # the pixels between are averages
     assert table.agrees(shown, expected)
+    assert not shown[(expected == 0).all(axis=-1)].any()  # outside the panel
+
+
+@pytest.mark.parametrize("name", ["aligned", "reprojected", "coarse, moved", "turned, mirrored", "homography"])
+def test_the_processor_shows_parts_as_the_reference_shows_them(name: str) -> None:
+    row = table.ROWS[name]
+    frame = row.frame()
+    sink = drawn_panels(None, (row.stack.width_px, row.stack.height_px), *row.panels)
+    assert frame.solved is not None
+    rows, columns = frame.solved.shape[1:3]
+    parts: tuple[Any, ...] = (np.s_[:], np.s_[:, rows // 2 :, columns // 3 :], np.s_[:, -9:-4, 7:12])
+    for version, part in enumerate(parts, start=1):
+        solved = np.full_like(frame.solved, rest_code(3))
+        solved[part] = frame.solved[part]
+        sink.present(now := replace(frame, solved=solved, solved_version=version))
+        shown, expected = np.stack(sink.read_back())[..., :3], row.reference(processor.BETWEEN, now)
+        by = 1 + (row.coarser > 1)  # the pixels between are averages
+        assert table.agrees(shown[:, ::by, ::by], expected[:, ::by, ::by])
 
 
 @NAMES
@@ -89,10 +103,4 @@ def test_a_horizon_across_a_panel_reads_nothing_outside_the_relief(sign: float) 
     height = table.STACK.height_px
     bent = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, sign / (height / 2 + 0.5), -sign))
     row = replace(table.ROWS["homography"], settings=PanelSettings(homography=bent))
-    panels = (row.settings,) * row.stack.count
-    sink = ProcessorDrawnPanels(
-        clock=SimulatedClock(), size_px=(row.stack.width_px, row.stack.height_px), panels=panels
-    )
-    sink.present(row.frame())
-    assert np.stack(sink.read_back()).shape == (3, height, row.stack.width_px, 4)
-    sink.close()
+    assert drawn(row, None).shape == (3, height, row.stack.width_px, 3)

@@ -47,8 +47,9 @@ def test_the_part_of_a_registered_panel_is_that_of_its_corners() -> None:
     assert filled_part(large, BOX, screen_from_panel=turned) == PixelRect(18, 26, 55, 74)
     oblique = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.002, 0.0, 1.0]])
     assert filled_part(large, BOX, screen_from_panel=oblique) == PixelRect(24, 14, 65, 53)
-    horizon = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1 / 60, 0.0, 1.0]])
-    assert filled_part(large, BOX, screen_from_panel=horizon) == PixelRect(0, 0, 240, 180)
+    for slope, box in ((-1 / 60, BOX), (-1 / 64, PixelRect(30, 22, 62, 51))):  # beyond and along an edge
+        horizon = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [slope, 0.0, 1.0]])
+        assert filled_part(large, box, screen_from_panel=horizon) == PixelRect(0, 0, 240, 180)
 
 
 @pytest.mark.parametrize("box", [PixelRect(5, 5, 5, 9), PixelRect(5, 5, 9, 5)])

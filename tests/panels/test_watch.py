@@ -25,9 +25,8 @@ EVERY_S = 0.1  # a round of all questions
 @pytest.fixture(autouse=True)
 def often(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shorten the intervals, which are seconds in the runtime."""
-    monkeypatch.setattr("runtime.panels.watch.EVERY_NS", round(EVERY_S * NS_PER_S))
-    monkeypatch.setattr("runtime.panels.window.RETRY_NS", round(EVERY_S * NS_PER_S))
-    monkeypatch.setattr("runtime.panels.window.LOOK_NS", round(EVERY_S * NS_PER_S))
+    for name in ("watch.EVERY_NS", "window.RETRY_NS", "window.LOOK_NS"):
+        monkeypatch.setattr(f"runtime.panels.{name}", round(EVERY_S * NS_PER_S))
 
 
 def lost(sink: WindowPanels, *, unchanged: bool = False, within_s: float = 3.0) -> str:
@@ -57,17 +56,21 @@ def comes_back(x: XServer, sink: WindowPanels, *monitors: int) -> bool:
 @pytest.mark.parametrize(
     ("does", "told"),
     [
-        (("XDestroyWindow",), "panel 1: the window was destroyed"),
-        (("XUnmapWindow",), "panel 1: the window was unmapped"),
-        (("XMoveWindow", 600, 7), "panel 1: the window is at 320x180+600+7, but must be at 320x180+0+0"),
+        (lambda x, window: x.ask_to_close(window), "a panel's window was closed"),
+        (lambda x, window: x.do_to_window("XDestroyWindow", window), "panel 1: the window was destroyed"),
+        (lambda x, window: x.do_to_window("XUnmapWindow", window), "panel 1: the window was unmapped"),
+        (
+            lambda x, window: x.do_to_window("XMoveWindow", window, 600, 7),
+            "panel 1: the window is at 320x180+600+7, but must be at 320x180+0+0",
+        ),
     ],
 )
-def test_windows_taken_or_moved_are_lost_panels_and_come_back(
-    x: XServer, opened: Callable[..., Any], does: tuple[Any, ...], told: str, unchanged: bool
+def test_windows_closed_taken_or_moved_are_lost_panels_and_come_back(
+    x: XServer, opened: Callable[..., Any], does: Callable[..., None], told: str, unchanged: bool
 ) -> None:
     sink = opened(*BY_CONNECTOR)
     assert presents(sink, 0)
-    x.do_to_window(does[0], x11_window(sink, 1), *does[1:])
+    does(x, x11_window(sink, 1))
     assert told in lost(sink, unchanged=unchanged)
     assert comes_back(x, sink, 2, 0, 1)
 

@@ -14,7 +14,6 @@ import pytest
 from runtime.clock import NS_PER_MS, NS_PER_S, SimulatedClock
 from runtime.config import PanelSettings
 from runtime.errors import PanelLost
-from runtime.optics.stack import PanelStack
 from runtime.panels import window
 from runtime.panels.card import identity_card
 from runtime.panels.display import glfw
@@ -25,7 +24,6 @@ from runtime.panels.xlib import OutputState
 from runtime.records import PanelFrame
 
 PANELS = tuple(PanelSettings(connector=f"DP-{n}") for n in range(2))
-STACK = PanelStack(0.5, 0.3, (-0.06, 0.06), 1920, 1080)
 
 
 class Screen:
@@ -94,7 +92,7 @@ def started(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Screen, Wind
         monkeypatch.setattr(window, "Display", lambda: screen.done.append("display") or screen)
         monkeypatch.setattr(window, "open_windows", screen.opened)
         monkeypatch.setattr(window, "glfw", SimpleNamespace(poll_events=lambda: None, GLFWError=glfw.GLFWError))
-        return screen, WindowPanels(PANELS, STACK, screen.clock, screen.context)
+        return screen, WindowPanels(PANELS, (1920, 1080), screen.clock, screen.context)
 
     return start
 
@@ -118,15 +116,16 @@ def test_a_drawn_frame_is_held_until_it_is_due_and_shown(started: Any) -> None:
     report = sink.present(frame(1), due_ns=NS_PER_S + 16 * NS_PER_MS)  # 3 ms of which showing takes
     assert (report.number, report.held_ns, report.skew_ms, report.vblank_ns) == (1, 13 * NS_PER_MS, 0.5, None)
     assert report.present_ns == NS_PER_S + 15_500_000
-    assert sink.present(frame(2)).held_ns is None
-    assert did(screen) == ["draw 1", "draw 2"]  # the context was never lent
+    assert sink.present(frame(2), due_ns=NS_PER_S).held_ns == 0 and sink.present(frame(3)).held_ns is None  # late, any
+    assert did(screen) == ["draw 1", "draw 2", "draw 3"]  # the context was never lent
     now_ns = screen.clock.now_ns()
     for due_ns, shown_ns in ((None, now_ns), (now_ns + 7, now_ns + 7), (now_ns - 7, now_ns)):
         report = sink.present(frame(3), unchanged=True, due_ns=due_ns)
         assert (report.number, report.present_ns, report.skew_ms, report.held_ns) == (3, shown_ns, 0.0, None)
     screen.damaged = True
     sink.present(frame(4), unchanged=True)
-    assert did(screen) == ["draw 4"]
+    sink.close()
+    assert did(screen) == ["draw 4", "abandon", "close display", "context"] and sink.contexts_lost == 0
 
 
 def test_frames_drawn_by_opengl_wait_for_a_blank_instead(started: Any) -> None:
@@ -185,6 +184,21 @@ def test_a_lost_context_closes_the_display_and_is_counted(started: Any, failure:
     assert did(screen) == ["abandon", "close display", "context", "context"] and sink.contexts_lost == 1
 
 
+def test_faults_while_closing_are_logged_and_all_opens_anew(started: Any, caplog: pytest.LogCaptureFixture) -> None:
+    screen, sink = started()
+    screen.faults.append("DP-1 was disconnected")
+    screen.close_windows = lambda: 1 / 0
+    did(screen)
+    assert lost(sink) == "DP-1 was disconnected" and "error while closing the windows" in caplog.text
+    assert did(screen) == ["release", "abandon", "close display", "context"]
+    screen.faults.clear()
+    screen.clock.advance_ns(NS_PER_S // 2)
+    assert sink.present(frame(2)).number == 2 and did(screen) == ["display", "open", "draw 2", "context"]
+    screen.close = screen.close_windows
+    sink.close()
+    assert "error while closing the display" in caplog.text and did(screen) == ["abandon", "context"]
+
+
 @pytest.mark.parametrize(
     ("turn", "change", "told"),
     [
@@ -199,14 +213,15 @@ def test_windows_and_monitors_are_asked_in_turn_within_a_second(
     started: Any, turn: int, change: dict[str, Any], told: str
 ) -> None:
     screen, sink = started()
+    sink.present(frame(0))  # takes 2 ms
     if turn < 2:
         vars(screen.windows[turn]).update(change)
     else:
         screen.connected[turn - 2] = replace(screen.connected[turn - 2], **change)
-    screen.clock.advance_ns(NS_PER_S - 1)
+    screen.clock.advance_ns(NS_PER_S - 2 * NS_PER_MS - 1)
     for number in range(turn + 1):  # the others, and none before its time
-        assert sink.present(frame(number)).number == number
-        screen.clock.advance_ns((1 if number == 0 else 250) * NS_PER_MS)
+        assert sink.present(frame(number), unchanged=True).number == number
+        screen.clock.advance_ns(1 if number == 0 else 250 * NS_PER_MS)
     assert lost(sink) == told if told else sink.present(frame(9))
 
 
@@ -231,5 +246,5 @@ def test_a_monitor_in_another_mode_is_refused_and_nothing_stays_open(started: An
     did(screen)
     screen.connected[1] = replace(screen.connected[1], width_px=1280)
     with pytest.raises(PanelLost, match="panel 1: DP-1 shows 1280x1080"):
-        WindowPanels(PANELS, STACK, screen.clock, screen.context)
+        WindowPanels(PANELS, (1920, 1080), screen.clock, screen.context)
     assert did(screen) == ["display", "close display", "context"]

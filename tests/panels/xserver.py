@@ -11,6 +11,7 @@ import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -146,9 +147,14 @@ class XServer:
         rows = np.frombuffer(data, np.uint8, stride * height, start).reshape(height, stride)
         return np.ascontiguousarray(rows[:, : pixel_bytes * width].reshape(height, width, pixel_bytes)[..., 2::-1])
 
+    def panels(self) -> list[npt.NDArray[np.uint8]]:
+        """(180, 320, 3) what each monitor shows, in one picture of all."""
+        screen = self.screenshot()[:HEIGHT_PX]
+        return [screen[:, WIDTH_PX * index : WIDTH_PX * (index + 1)] for index in range(3)]
+
     def panel(self, index: int) -> npt.NDArray[np.uint8]:
-        """(180, 320, 3) what monitor `index` shows."""
-        return self.screenshot()[:HEIGHT_PX, WIDTH_PX * index : WIDTH_PX * (index + 1)]
+        """What monitor `index` shows."""
+        return self.panels()[index]
 
     def set_edid(self, index: int, data: bytes) -> None:
         """Give an output the EDID that a real monitor would have brought."""
@@ -172,7 +178,7 @@ class XServer:
             event = (ctypes.c_ulong * 24)(client_message, 0, 1, display.value, window, protocols, bits, delete)
             x11.XSendEvent(display, ctypes.c_ulong(window), 0, ctypes.c_long(0), event)
 
-    def do_to_window(self, request: str, window: int, *arguments: int) -> None:
+    def do_to_window(self, request: str, window: int, *arguments: Any) -> None:
         """A request of Xlib about somebody else's window, as another program would make it."""
         with self._connected() as (x11, display):
             getattr(x11, request)(display, ctypes.c_ulong(window), *arguments)
