@@ -2,12 +2,15 @@
 // alive while it is used, and lets other Python threads run during calls.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/array.h>
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/pair.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
 #include "loops.hpp"
+#include "panels.hpp"
 #include "solver.hpp"
 
 namespace nb = nanobind;
@@ -17,7 +20,7 @@ int processor_level = 1;
 
 namespace {
 
-constexpr int INTERFACE = 1;  // also in __init__.py; raised by every change that older Python code cannot call
+constexpr int INTERFACE = 2;  // also in __init__.py; raised by every change that older Python code cannot call
 
 template <typename T> using Array = nb::ndarray<T, nb::device::cpu, nb::c_contig>;
 template <typename T> using Strided = nb::ndarray<T, nb::device::cpu>;
@@ -210,6 +213,79 @@ int write_ramps(const HeldPart &held, const Array<const double> &eye, const Arra
   return outline_ramps(held.part, eye.data(), clip_from_part.data(), size_px.first, size_px.second, ramp_px, to);
 }
 
+typedef std::array<float, 4> Map;  // scales across and down, shifts across and down
+
+ScaleShift scale_shift(const Map &map) {
+  require(std::all_of(map.begin(), map.end(), [](float x) { return std::abs(x) < 1e9f; }), "a map is not finite");
+  return {map[0], map[1], map[2], map[3]};
+}
+
+template <typename AnyArray>
+void require_pixels(const AnyArray &picture, int64_t least_px) {
+  constexpr const char *message = "a picture must be (rows, columns, 4) with contiguous rows";
+  require(picture.ndim() == 3 && channels_of(picture, message) == 4, message);
+  for (int axis = 0; axis < 2; ++axis) require(int64_t(picture.shape(axis)) >= least_px && picture.shape(axis) <= MAX_SIDE, "a picture's size is out of range");
+  require(picture.stride(0) >= 0 && picture.stride(0) % 4 == 0 && uintptr_t(picture.data()) % 4 == 0, message);
+}
+
+// `Shown` with the arrays that it reads and writes.
+struct HeldPicture {
+  Strided<const uint8_t> source;
+  Strided<uint8_t> screen;
+  std::optional<Strided<const uint8_t>> flat;
+  std::optional<Array<const uint32_t>> curve;
+  std::optional<Array<const float>> relief;
+  Shown shown{};
+
+  HeldPicture(Strided<const uint8_t> of_source, Strided<uint8_t> of_screen, const Map &source_from_panel, std::optional<Array<const double>> panel_from_screen, Size panel_px, std::optional<Array<const float>> of_relief, const Map &relief_from_screen, const Map &push, std::optional<Strided<const uint8_t>> of_flat, float flatness, std::optional<Array<const uint32_t>> of_curve, int every)
+      : source(std::move(of_source)), screen(std::move(of_screen)), flat(std::move(of_flat)), curve(std::move(of_curve)), relief(std::move(of_relief)) {
+    require_pixels(source, 2), require_pixels(screen, 1);
+    shown.source = source.data(), shown.source_stride = source.stride(0), shown.screen = screen.data(), shown.screen_stride = screen.stride(0);
+    shown.source_rows = size_of(source, 0), shown.source_columns = size_of(source, 1), shown.rows = size_of(screen, 0), shown.columns = size_of(screen, 1);
+    require(int64_t(shown.source_rows) * shown.source_stride <= INT32_MAX, "a picture is too large");  // offsets have 32 bits
+    shown.source_from_panel = scale_shift(source_from_panel), shown.relief_from_screen = scale_shift(relief_from_screen), shown.push = scale_shift(push);
+    require(0 <= flatness && flatness <= 1, "a flatness must be from 0 to 1");
+    require(every == 1 || (every == 2 && !flat), "only pictures without a flat one can be sampled at every other pixel");
+    shown.flatness = flatness, shown.every = every;
+    if (flat) {
+      require_pixels(*flat, 1);
+      require(size_of(*flat, 0) == shown.rows && size_of(*flat, 1) == shown.columns, "a flat picture must have the screen's size");
+      shown.flat = flat->data(), shown.flat_stride = flat->stride(0);
+    }
+    if (curve) require_shape(*curve, {3, CURVE}, "a curve must be (3, 1024)"), shown.curve = curve->data();
+    if (relief) {
+      require_shape(*relief, {-1, -1}, "a relief must be (rows, columns)");
+      require(relief->size() >= 1, "a relief must have a pixel");
+      shown.relief = relief->data(), shown.relief_rows = size_of(*relief, 0), shown.relief_columns = size_of(*relief, 1);
+    }
+    if ((shown.registered = panel_from_screen.has_value())) {
+      require_shape(*panel_from_screen, {3, 3}, "a homography must be (3, 3)");
+      require(usable(panel_from_screen->data(), 1), "a homography is not finite");
+      std::copy(panel_from_screen->data(), panel_from_screen->data() + 9, shown.panel_from_screen);
+      std::tie(shown.panel_rows, shown.panel_columns) = panel_px;
+    }
+  }
+};
+
+void draw_pictures(const std::vector<const HeldPicture *> &pictures, int threads) {
+  std::vector<Shown> shown;
+  for (const HeldPicture *picture : pictures) shown.push_back(picture->shown);
+  nb::gil_scoped_release others_run;
+  draw_panels(shown.data(), int(shown.size()), threads);
+}
+
+std::tuple<int, int, int, int> framed(const Strided<const uint8_t> &turned, Array<uint8_t> &picture, int border_px, int extended_px) {
+  constexpr const char *message = "a turned picture must be (rows, columns, 4), and the framed one larger by the border";
+  require(turned.ndim() == 3 && turned.shape(2) == 4 && turned.stride(2) == 1 && uintptr_t(turned.data()) % 4 == 0, message);
+  for (int axis = 0; axis < 2; ++axis) require(turned.shape(axis) >= 1 && turned.stride(axis) % 4 == 0, message);
+  require(border_px >= 0 && border_px <= MAX_SIDE && extended_px >= 0 && extended_px <= std::min(border_px, 1), "a border is out of range");
+  const int rows = size_of(turned, 0), columns = size_of(turned, 1);
+  require_pixels(picture, 1);
+  require_shape(picture, {rows + 2 * border_px, columns + 2 * border_px, 4}, message);
+  const auto [left, top, right, bottom] = frame_picture(turned.data(), turned.stride(0), turned.stride(1), rows, columns, picture.data(), border_px, extended_px);
+  return {left, top, right, bottom};
+}
+
 std::vector<int> levels() {
 #if EVERY_LEVEL
   std::vector<int> usable;
@@ -277,6 +353,13 @@ NB_MODULE(compiled, m) {
 
   m.def("squared_error", &light_error, "layers"_a.noconvert(), "target"_a.noconvert(), "centre_from_image"_a.noconvert(), "panels_from_centre"_a.noconvert(),
         "toward"_a.noconvert(), "table"_a.noconvert(), "rays"_a, "step"_a, "rows"_a);
+
+  nb::class_<HeldPicture>(m, "PanelPicture")
+      .def(nb::init<Strided<const uint8_t>, Strided<uint8_t>, const Map &, std::optional<Array<const double>>, Size, std::optional<Array<const float>>, const Map &, const Map &, std::optional<Strided<const uint8_t>>, float, std::optional<Array<const uint32_t>>, int>(),
+           "source"_a.noconvert(), "screen"_a.noconvert(), "source_from_panel"_a, "panel_from_screen"_a.noconvert().none(), "panel_px"_a, "relief"_a.noconvert().none(), "relief_from_screen"_a, "push"_a,
+           "flat"_a.noconvert().none(), "flatness"_a, "curve"_a.noconvert().none(), "every"_a);
+  m.def("draw_panels", &draw_pictures, "pictures"_a, "threads"_a);
+  m.def("frame_picture", &framed, "turned"_a.noconvert(), "framed"_a.noconvert(), "border_px"_a, "extended_px"_a);
 
   nb::class_<HeldPart>(m, "OutlinedPart")
       .def(nb::init<Array<const float>, Array<const int32_t>, Array<const int32_t>, Array<const int32_t>, Array<const double>, Array<const double>>(),

@@ -6,7 +6,7 @@ object does at a time is up to the caller. The parts of a problem may run on sev
 
 from collections.abc import Sequence
 
-from numpy import float32, float64, int16, int32, uint8
+from numpy import float32, float64, int16, int32, uint8, uint32
 from numpy.typing import NDArray
 
 INTERFACE: int
@@ -100,6 +100,42 @@ def squared_error(
     rows: tuple[int, int],
 ) -> tuple[float, int]:
     """Return the sum of squared errors over rows of the target, and the number of terms."""
+
+class PanelPicture:
+    """A picture that the processor draws on a panel's screen. Holds the arrays, of which `screen` is written.
+
+    Maps are scales across and down, and shifts. Positions in pictures count from the centre of the top left pixel,
+    positions on the screen and the panel from their corners.
+    """
+
+    def __init__(
+        self,
+        source: NDArray[uint8],  # (rows, columns, 4) RGBA; positions outside it are moved to its edge
+        screen: NDArray[uint8],  # (rows, columns, 4) BGRX
+        source_from_panel: tuple[float, float, float, float],
+        panel_from_screen: NDArray[float64] | None,  # (3, 3); None if their pixels coincide
+        panel_px: tuple[int, int],  # rows and columns, outside which a registered panel's screen shows 0
+        relief: NDArray[float32] | None,  # (rows, columns)
+        relief_from_screen: tuple[float, float, float, float],  # from the panel's pixels if it is registered
+        push: tuple[float, float, float, float],  # displacement in the source's pixels by a relief of 1, on the panel
+        flat: NDArray[uint8] | None,  # the screen's size, to be mixed in
+        flatness: float,  # its weight, from 0 to 1
+        curve: NDArray[uint32] | None,  # (3, 1024) grey curve: one byte for each quarter of a code, blue, green and red
+        every: int,  # 1, or 2 to sample every other pixel of every other row and average between; not with `flat`
+    ) -> None: ...
+
+def draw_panels(pictures: Sequence[PanelPicture], threads: int) -> None:
+    """Draw pictures on several threads with the caller's priority."""
+
+def frame_picture(
+    turned: NDArray[uint8],  # (rows, columns, 4), with any strides
+    framed: NDArray[uint8],  # larger by the border
+    border_px: int,
+    extended_px: int,  # 1: the innermost pixel of the border repeats the picture's edge
+) -> tuple[int, int, int, int]:
+    """Copy a turned picture into the middle of one with a border, and return the box (left, top, right, bottom in the
+    framed picture) of the pixels that differ from the border in colour. Without a border, the box is meaningless.
+    """
 
 class OutlinedPart:
     """A part's edges (`runtime.content.fringe.Edges`) and vertices. Holds the arrays."""

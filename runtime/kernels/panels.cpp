@@ -1,48 +1,18 @@
 // Draw the panels' pictures on the processor (runtime/panels/processor.py): sample a layer, which may be coarse and
-// displaced by the content's relief, mix it with the flat picture and apply the panel's grey curve. Pixels have four
-// bytes, in the order RGBA in pictures and BGRX on the screen. Positions in pictures count from the centre of the top left pixel, positions on the screen and the panel from
-// their corners. The panel's pixels are turned like the screen's, and coincide with them unless `registered` is 1.
+// displaced by the content's relief, mix it with the flat picture and apply the panel's grey curve.
 #include <pthread.h>
 #include <sched.h>
 
 #include <vector>
 
-#include "sampling.hpp"
-
-#define EXPORTED extern "C" __attribute__((visibility("default")))
+#include "panels.hpp"
 
 namespace {
 
-constexpr int CURVE = 1024;      // entries of a grey curve for each channel, indexed by quarters of a code
 constexpr int FRACTION = 7;      // fractional bits of values while pictures are interpolated and mixed
 constexpr int UNIT = 1 << 15;    // a pixel, and an interpolation weight of 1, in fixed point
 constexpr int BLOCK_PX = 64;     // columns drawn together; where the relief is zero, a block is cheaper
 constexpr int MAX_THREADS = 16;
-
-struct ScaleShift {
-  float scale_u, scale_v, shift_u, shift_v;
-};
-
-struct Shown {
-  const uint8_t *source;  // picture to sample; positions outside it are moved to its edge
-  int64_t source_stride;  // bytes from row to row, as are the other strides
-  uint8_t *screen;        // picture to draw
-  int64_t screen_stride;
-  const uint8_t *flat;  // picture of the screen's size to mix in, or null
-  int64_t flat_stride;
-  const uint32_t *curve;  // (3, CURVE) the screen's pixels with one byte each, blue, green and red; or null
-  const float *relief;   // (relief_rows, relief_columns), or null
-  int32_t source_rows, source_columns, rows, columns, relief_rows, relief_columns, panel_rows, panel_columns;
-  ScaleShift source_from_panel;
-  ScaleShift relief_from_screen;  // from the panel's pixels if `registered` is 1
-  ScaleShift push;             // displacement, in the source's pixels, by a relief of 1, from positions on the panel
-  int32_t registered;          // 1 if `panel_from_screen` applies
-  float panel_from_screen[9];  // homography; outside the panel, the screen shows the value 0
-  float flatness;   // weight of `flat`
-  // 1 to sample every pixel; 2 to sample every other pixel of every other row and average between them, which needs
-  // `flat` to be null.
-  int32_t every;
-};
 
 typedef uint16_t Pair __attribute__((may_alias));  // two of a pixel's bytes
 typedef uint32_t Word __attribute__((may_alias));  // both of a pixel's pairs
@@ -77,7 +47,18 @@ struct Relief {
   std::vector<float> right;      // weight of the next one
   std::vector<float> lines[2];   // two rows of the relief, resampled to the screen's columns
   std::vector<uint8_t> rises[2];  // for each of their blocks, whether any relief is not zero
-  int number[2] = {-1, -1};      // numbers of these rows
+  int number[2];                  // numbers of these rows
+};
+
+// Memory for a thread, which allocates none itself: it could not report that there is none.
+struct Memory {
+  Relief kept;
+  std::vector<uint32_t> lines[2], between_lines;
+
+  void reserve(size_t columns) {
+    kept.first.reserve(columns), kept.right.reserve(columns), between_lines.reserve(columns);
+    for (int k = 0; k < 2; ++k) kept.lines[k].reserve(columns), kept.rises[k].reserve(columns), lines[k].reserve(columns);
+  }
 };
 
 INLINE void prepare(const Shown &shown, Relief &kept) {
@@ -89,7 +70,7 @@ INLINE void prepare(const Shown &shown, Relief &kept) {
     kept.first[c] = std::min(int(u), std::max(last - 1, 0));
     kept.right[c] = u - float(kept.first[c]);
   }
-  for (int k = 0; k < 2; ++k) kept.lines[k].resize(shown.columns), kept.rises[k].resize(shown.columns / BLOCK_PX + 1);
+  for (int k = 0; k < 2; ++k) kept.lines[k].resize(shown.columns), kept.rises[k].resize(shown.columns / BLOCK_PX + 1), kept.number[k] = -1;
 }
 
 // Return a row of the relief, resampled to the screen's columns.
@@ -321,9 +302,9 @@ INLINE void widen(const Shown &shown, const uint32_t *line, uint8_t *screen) {
   if (shown.columns % 2) pixels[shown.columns - 1] = shown.curve ? curved(line[pairs]) : line[pairs];
 }
 
-INLINE void draw_rows_any(const Shown &shown, int begin, int end) {
+INLINE void draw_rows_any(const Shown &shown, int begin, int end, Memory &memory) {
   Block block;
-  Relief kept;
+  Relief &kept = memory.kept;
   if (shown.every == 1) {
     if (shown.relief) prepare(shown, kept);
     for (int r = begin; r < end; ++r)
@@ -332,31 +313,32 @@ INLINE void draw_rows_any(const Shown &shown, int begin, int end) {
   }
   const Shown half = halved(shown);
   if (half.relief) prepare(half, kept);
-  std::vector<uint32_t> lines[2], between_lines(half.columns);
-  for (auto &line : lines) line.resize(half.columns);
+  auto &lines = memory.lines;
+  for (auto *line : {lines, lines + 1, &memory.between_lines}) line->resize(half.columns);
   draw_row(half, begin / 2, bytes_of(lines[begin / 2 & 1]), kept, block);
   for (int r = begin; r < end; ++r) {
     const uint32_t *line = lines[r / 2 & 1].data();
     if (r % 2) {
       draw_row(half, r / 2 + 1, bytes_of(lines[(r / 2 + 1) & 1]), kept, block);
-      average(line, lines[(r / 2 + 1) & 1].data(), between_lines.data(), half.columns);
-      line = between_lines.data();
+      average(line, lines[(r / 2 + 1) & 1].data(), memory.between_lines.data(), half.columns);
+      line = memory.between_lines.data();
     }
     widen(shown, line, shown.screen + r * shown.screen_stride);
   }
 }
 
-FOR_EVERY_LEVEL(draw_rows, void, (const Shown &shown, int begin, int end), (shown, begin, end))
+FOR_EVERY_LEVEL(draw_rows, void, (const Shown &shown, int begin, int end, Memory &memory), (shown, begin, end, memory))
 
 struct Part {
   const Shown *shown;
   int count, part, parts;
+  Memory memory;
 };
 
 void *draw_part(void *given) {
-  const Part &part = *static_cast<const Part *>(given);
+  Part &part = *static_cast<Part *>(given);
   for (const Shown *shown = part.shown; shown < part.shown + part.count; ++shown)
-    draw_rows(*shown, shown->rows * part.part / part.parts, shown->rows * (part.part + 1) / part.parts);
+    draw_rows(*shown, shown->rows * part.part / part.parts, shown->rows * (part.part + 1) / part.parts, part.memory);
   return nullptr;
 }
 
@@ -384,10 +366,7 @@ bool start(pthread_t &thread, Part &part) {
 
 }  // namespace
 
-// Copy a turned picture into the middle of one that has a border. The turned picture's next row and next column are
-// `row_step` and `column_step` bytes away. Return the box of the pixels that differ from the border in colour: its left,
-// top, right and bottom edge in the framed picture. Without a border, the box is meaningless.
-EXPORTED void frame_picture(const uint8_t *turned, int64_t row_step, int64_t column_step, int rows, int columns, uint8_t *framed, int border_px, int extended, int32_t *box) {
+std::array<int, 4> frame_picture(const uint8_t *turned, int64_t row_step, int64_t column_step, int rows, int columns, uint8_t *framed, int border_px, int extended) {
   const int width = columns + 2 * border_px;
   auto *middle = reinterpret_cast<Word *>(framed) + border_px * (width + 1);
   const Word border = *reinterpret_cast<const Word *>(framed) << 8;  // without alpha
@@ -404,25 +383,26 @@ EXPORTED void frame_picture(const uint8_t *turned, int64_t row_step, int64_t col
     if (first < end) left = std::min(left, first), right = std::max(right, end), top = std::min(top, r), bottom = r + 1;
     if (extended) to[-1] = to[0], to[columns] = to[columns - 1];
   }
-  box[0] = left + border_px, box[1] = top + border_px, box[2] = right + border_px, box[3] = bottom + border_px;
-  if (!extended) return;
-  Word *last = middle + int64_t(rows - 1) * width;
-  std::memcpy(middle - width - 1, middle - 1, size_t(columns + 2) * 4);
-  std::memcpy(last + width - 1, last - 1, size_t(columns + 2) * 4);
+  if (extended) {
+    Word *last = middle + int64_t(rows - 1) * width;
+    std::memcpy(middle - width - 1, middle - 1, size_t(columns + 2) * 4);
+    std::memcpy(last + width - 1, last - 1, size_t(columns + 2) * 4);
+  }
+  return {left + border_px, top + border_px, right + border_px, bottom + border_px};
 }
 
-// Draw pictures on several threads with the caller's priority. Each thread draws the same share of every picture's rows.
-EXPORTED void draw_panels(const Shown *shown, int count, int threads) {
+void draw_panels(const Shown *shown, int count, int threads) {
   const int parts = std::clamp(threads, 1, MAX_THREADS);
   Part part[MAX_THREADS];
   pthread_t thread[MAX_THREADS];
   bool started[MAX_THREADS] = {};
-  for (int n = 0; n < parts; ++n) part[n] = {shown, count, n, parts};
+  for (int n = 0; n < parts; ++n) {
+    part[n] = {shown, count, n, parts, {}};
+    for (int k = 0; k < count; ++k) part[n].memory.reserve(size_t(shown[k].columns) + 1);
+  }
   for (int n = 1; n < parts; ++n) started[n] = start(thread[n], part[n]);
   for (int n = 0; n < parts; ++n)
     if (!started[n]) draw_part(&part[n]);
   for (int n = 1; n < parts; ++n)
     if (started[n]) pthread_join(thread[n], nullptr);
 }
-
-EXPORTED const int32_t shown_bytes = sizeof(Shown);

@@ -10,10 +10,9 @@ and takes Python's global lock as rarely as possible.
 
 from __future__ import annotations
 
-import ctypes
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, TypeVar
 
 import cv2
@@ -21,13 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.config import PanelSettings
-from runtime.kernels import CURVE_ENTRIES, CURVE_STEPS, ScaleShift, ShownPanel, panel_loops
+from runtime.kernels import CURVE_ENTRIES, CURVE_STEPS, library
 from runtime.optics.malus import rest_code
 from runtime.optics.presentation import Interpolation, Mount, PanelDraw, PixelMap, on_layer, panel_draws
 from runtime.optics.rect import PixelRect, union
 from runtime.optics.stack import between_pixel_centres
 from runtime.panels.geometry import layer_from_screen, panel_from_screen
-from runtime.panels.shown_part import filled_part, limit
+from runtime.panels.shown_part import Map, ShownPicture, filled_part, limited
 from runtime.records import F32, F64, U8, PanelFrame
 
 # If solutions coarser than the panels by this factor are moved by the alignment, they are sampled at every other pixel.
@@ -172,19 +171,18 @@ class ProcessorPainter:
             filled[panel] = self._filled_by(panel, shown, solved if flat is None else None)
             part = union((filled[panel], self._filled[panel]))
             if part.width_px:
-                limit(shown, part)
-                to_draw.append(shown)
+                to_draw.append((shown if flat is not None else limited(shown, part)).checked())
                 parts[panel] = part
         if to_draw:
-            panel_loops().draw_panels((ShownPanel * len(to_draw))(*to_draw), len(to_draw), self._threads)
+            library().draw_panels(to_draw, self._threads)
         self._drawn, self._filled = drawn, filled
         return parts
 
-    def _filled_by(self, panel: int, shown: ShownPanel, solved: _Solution | None) -> PixelRect:
+    def _filled_by(self, panel: int, shown: ShownPicture, solved: _Solution | None) -> PixelRect:
         """Return the part of a picture outside which it shows the rest code; `solved` may be None."""
         if solved is None:
             return _whole(self._screens[panel])
-        mounting, rise = self._mountings[panel], solved.rises[panel] if shown.relief else 0.0
+        mounting, rise = self._mountings[panel], 0.0 if shown.relief is None else solved.rises[panel]
         return filled_part(shown, solved.boxes[panel], rise=rise, screen_from_panel=mounting.screen_from_turned)
 
     def _prepared_solution(self, frame: PanelFrame, draws: Sequence[PanelDraw]) -> _Solution:
@@ -221,55 +219,37 @@ class ProcessorPainter:
         turned = [mounting.on_screen(layer) for layer, mounting in zip(layers, self._mountings, strict=True)]
         pictures, boxes = memory.pictures([_size_px(layer) for layer in turned], border_px=border_px), []
         for picture, layer, extended in zip(pictures, turned, extended_px or [0] * len(turned), strict=True):
-            rows, columns = layer.shape[:2]
-            box = (ctypes.c_int32 * 4)()
-            panel_loops().frame_picture(
-                layer.ctypes.data, *layer.strides[:2], rows, columns, picture.ctypes.data, border_px, extended, box
-            )
-            boxes.append(PixelRect(*box))
+            boxes.append(PixelRect(*library().frame_picture(layer, picture, border_px, extended)))
         return pictures, tuple(boxes)
 
     def _shown(
         self, panel: int, draw: PanelDraw, solved: _Solution | None, flat: _Pictures | None, *, is_moved: bool
-    ) -> tuple[object, ShownPanel]:
-        """Return a key that identifies the panel's picture, and the arguments that draw it."""
-        screen, curve = self._screens[panel], self._curves[panel]
-        shown = ShownPanel(
-            screen=screen.ctypes.data,
-            screen_stride=screen.strides[0],
-            rows=screen.shape[0],
-            columns=screen.shape[1],
-            every=1,
-        )
-        if curve is not None:
-            shown.curve = curve.ctypes.data
-        source = solved if solved is not None else flat
-        assert source is not None
-        picture = source.pictures[panel]
-        shown.source, shown.source_stride = picture.ctypes.data, picture.strides[0]
-        shown.source_rows, shown.source_columns = picture.shape[:2]
+    ) -> tuple[object, ShownPicture]:
+        """Return a key that identifies the panel's picture, and how to draw it."""
+        screen, curve, mounting = self._screens[panel], self._curves[panel], self._mountings[panel]
         if solved is None:
-            shown.source_from_panel = ScaleShift(1.0, 1.0, -0.5, -0.5)
-            return ("flat", source.version), shown
+            assert flat is not None
+            flat_from_screen = (1.0, 1.0, -0.5, -0.5)
+            return ("flat", flat.version), ShownPicture(flat.pictures[panel], screen, flat_from_screen, curve=curve)
         maps = self._maps(panel, draw, solved)
-        shown.source_from_panel = ScaleShift(*maps[0])
-        mounting = self._mountings[panel]
-        if mounting.turned_from_screen is not None:
-            shown.registered, (shown.panel_columns, shown.panel_rows) = 1, mounting.turned_px
-            shown.panel_from_screen[:] = mounting.turned_from_screen.ravel().tolist()
+        shown = ShownPicture(
+            solved.pictures[panel],
+            screen,
+            maps[0],
+            panel_from_screen=mounting.turned_from_screen,
+            panel_px=mounting.turned_px[::-1],
+            curve=curve,
+        )
         if maps[1:]:
-            relief = solved.reliefs[panel]
-            shown.relief, (shown.relief_rows, shown.relief_columns) = relief.ctypes.data, relief.shape
-            shown.relief_from_screen, shown.push = ScaleShift(*maps[1]), ScaleShift(*maps[2])
+            shown = replace(shown, relief=solved.reliefs[panel], relief_from_screen=maps[1], push=maps[2])
         if flat is None:
-            shown.every += is_moved and draw.size_px[0] >= COARSE * draw.solved_px[0]
-            return (solved.version, *maps), shown
-        other = flat.pictures[panel]
-        shown.flat, shown.flat_stride, shown.flatness = other.ctypes.data, other.strides[0], draw.flatness
+            every = 2 if is_moved and draw.size_px[0] >= COARSE * draw.solved_px[0] else 1
+            return (solved.version, *maps), replace(shown, every=every)
+        shown = replace(shown, flat=flat.pictures[panel], flatness=draw.flatness)
         return (solved.version, *maps, flat.version, draw.flatness), shown
 
-    def _maps(self, panel: int, draw: PanelDraw, solved: _Solution) -> list[tuple[float, float, float, float]]:
-        """Return a record's maps (scale_u, scale_v, shift_u, shift_v) for the turned layer's pixels. The first leads to
+    def _maps(self, panel: int, draw: PanelDraw, solved: _Solution) -> list[Map]:
+        """Return a record's maps for the turned layer's pixels. The first leads to
         positions in the source. If the content's relief displaces them, two follow: to positions in the relief, and to
         the displacement by a relief of 1. Positions count from the centre of a picture's top left pixel.
         """

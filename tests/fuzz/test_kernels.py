@@ -151,3 +151,60 @@ def test_any_homography_is_sampled_or_refused(first: int) -> None:
         assert np.abs(result).max() <= 8191
         with np.errstate(all="ignore"):
             warp(image, matrix, size=result.shape[:2], outside=0)
+
+
+def drawing_of(seed: int) -> dict[str, Any]:
+    """A random `PanelPicture` but for its screen; every fourth number that can be huge is."""
+    rng = np.random.default_rng(seed)
+
+    def sizes(least: int) -> list[int]:
+        return np.maximum(rng.choice([1, 2, 3, 64, 65, 130], 2), least).tolist()
+
+    def number(scale: float) -> float:
+        return float(rng.normal(0, scale) * 10.0 ** (rng.choice([0, 0, 0, 8]) * rng.random()))
+
+    def map_() -> tuple[float, ...]:
+        return (number(2), number(2), number(50), number(50))
+
+    screen, registered = sizes(1), rng.random() < 0.5
+    flat = rng.integers(0, 256, (*screen, 4), np.uint8) if rng.random() < 0.4 else None
+    homography = np.eye(3) + rng.normal(0, 1, (3, 3)) * 10.0 ** rng.uniform(-4, 3, (3, 3))
+    return {
+        "source": rng.integers(0, 256, (*sizes(2), 4), np.uint8),
+        "source_from_panel": (1.0, 1.0, 0.5, 0.5) if rng.random() < 0.2 else map_(),
+        "panel_from_screen": homography * number(1) if registered else None,
+        "panel_px": tuple(sizes(1)),
+        "relief": rng.normal(0, 1, sizes(1)).astype(np.float32) if rng.random() < 0.5 else None,
+        "relief_from_screen": map_(),
+        "push": map_(),
+        "flat": flat,
+        "flatness": float(rng.random()),
+        "curve": rng.integers(0, 256, (3, 1024), np.uint32) if rng.random() < 0.5 else None,
+        "every": 1 if flat is not None else int(rng.choice([1, 2])),
+        "screen_px": screen,
+    }
+
+
+@pytest.mark.parametrize("first", range(FIRST, FIRST + 10 * EXAMPLES, 10 * BATCH))
+def test_any_picture_is_drawn_within_its_screen_or_refused(first: int) -> None:
+    """By any number of threads alike, whatever its maps, homography and relief."""
+    loops, done = kernels.library(), 0
+    for seed in range(first, first + 10 * BATCH):
+        how = drawing_of(seed)
+        rows, columns = how.pop("screen_px")
+        drawn = []
+        for threads in (1, 3):
+            memory = np.full((rows + 2, columns + 2, 4), 77, np.uint8)
+            try:
+                picture = loops.PanelPicture(screen=memory[1:-1, 1:-1], **how)
+            except ValueError:
+                continue
+            loops.draw_panels([picture], threads)
+            drawn.append(memory)
+            memory_inside = memory[1:-1, 1:-1].copy()
+            memory[1:-1, 1:-1] = 77
+            assert (memory == 77).all(), seed
+            memory[1:-1, 1:-1] = memory_inside
+        done += len(drawn) // 2
+        assert not drawn or (drawn[0] == drawn[1]).all(), seed
+    assert done > 5 * BATCH

@@ -7,6 +7,7 @@ import mmap
 import os
 import resource
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -105,6 +106,61 @@ def test_nothing_is_read_or_written_past_an_array_s_end(channels: int, width: in
     image, result = guarded(rng.integers(0, 4081, shape, np.int16)), guarded(np.zeros(shape, np.int16))
     loops.Source(image).warp(result, matrices[0, 0], (0.0, 0.0), (0.0, 0.0), 3.0, -1, (0, rows))
     assert (result >= 0).all()
+    turned, framed = (
+        guarded(rng.integers(1, 256, layers.shape, np.uint8)),
+        guarded(np.zeros((rows + 2, width + 2, 4), np.uint8)),
+    )
+    assert loops.frame_picture(turned, framed, 1, 1) == (1, 1, width + 1, rows + 1)
+    loops.draw_panels([picture(framed, guarded(np.zeros_like(layers)))], 2)
+
+
+SAME = (1.0, 1.0, 0.0, 0.0)
+
+
+def picture(source: NDArray[Any], screen: NDArray[Any], **how: Any) -> Any:
+    usual: dict[str, Any] = {
+        "source_from_panel": SAME, "panel_from_screen": None, "panel_px": (0, 0), "relief": None,
+        "relief_from_screen": SAME, "push": SAME, "flat": None, "flatness": 0.0, "curve": None, "every": 1,
+    }  # fmt: skip
+    return kernels.library().PanelPicture(source=source, screen=screen, **{**usual, **how})
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"source": np.zeros((1, 9, 4), np.uint8)},  # a neighbour to the right and below is read
+        {"source": np.zeros((9, 9, 3), np.uint8)},
+        {"source": np.zeros((9, 18, 4), np.uint8)[:, ::2]},
+        {"source": np.zeros((9, 37), np.uint8)[:, 1:].reshape(9, 9, 4)[::-1]},
+        {"source": np.broadcast_to(np.zeros((1, 9, 4), np.uint8), (70000, 9, 4))},
+        {"screen": np.zeros((5, 0, 4), np.uint8)},
+        {"source_from_panel": (1.0, 1.0, np.nan, 0.0)},
+        {"push": (1.0, np.inf, 0.0, 0.0)},
+        {"relief_from_screen": (1e10, 1.0, 0.0, 0.0)},
+        {"panel_from_screen": np.diag([1.0, np.nan, 1.0])},
+        {"panel_from_screen": np.eye(2)},
+        {"relief": np.zeros((0, 3), np.float32)},
+        {"flat": np.zeros((5, 8, 4), np.uint8)},
+        {"flat": np.zeros((5, 7, 4), np.uint8), "every": 2},
+        {"flatness": -0.1},
+        {"flatness": 1.1},
+        {"curve": np.zeros((3, 256), np.uint32)},
+        {"every": 0},
+        {"every": 3},
+    ],
+    ids=str,
+)
+def test_only_pictures_that_fit_are_drawn(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=r"\w"):
+        picture(**{"source": np.zeros((9, 9, 4), np.uint8), "screen": np.zeros((5, 7, 4), np.uint8), **wrong})
+
+
+def test_only_pictures_that_fit_are_framed() -> None:
+    frame, turned = kernels.library().frame_picture, np.full((3, 5, 4), 9, np.uint8)
+    assert frame(turned[::-1, ::-1], np.zeros((7, 9, 4), np.uint8), 2, 0) == (2, 2, 7, 5)
+    for size, border_px, extended_px in (((3, 5, 4), 1, 0), ((5, 8, 4), 1, 0), ((5, 7, 4), -1, 0), ((5, 7, 4), 1, 2)):
+        with pytest.raises(ValueError, match="border"):
+            frame(turned, np.zeros(size, np.uint8), border_px, extended_px)
 
 
 def test_the_loops_take_only_arrays_that_fit() -> None:
@@ -276,6 +332,25 @@ def test_too_little_memory_is_an_exception() -> None:
         resource.setrlimit(resource.RLIMIT_AS, (used + 50_000_000, -1))
         try:
             solving.step(Step(size=1.0))
+        except MemoryError:
+            os._exit(0)
+        os._exit(1)
+    assert os.waitpid(child, 0)[1] == 0
+
+
+def test_too_little_memory_to_draw_is_an_exception() -> None:
+    """On any number of threads, which could not raise it."""
+    wide = picture(np.zeros((9, 9, 4), np.uint8), np.zeros((1, 1 << 16, 4), np.uint8))
+    child = os.fork()
+    if child == 0:
+        used = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+        resource.setrlimit(resource.RLIMIT_AS, (used, -1))
+        held: list[bytearray] = []
+        with suppress(MemoryError):
+            while True:
+                held.append(bytearray(1 << 17))
+        try:
+            kernels.library().draw_panels([wide], 2)  # needs 256 kB at once
         except MemoryError:
             os._exit(0)
         os._exit(1)

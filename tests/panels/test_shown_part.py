@@ -9,16 +9,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.kernels import ScaleShift, ShownPanel
 from runtime.optics.rect import PixelRect
-from runtime.panels.shown_part import filled_part
+from runtime.panels.shown_part import ShownPicture, filled_part
 
 BOX = PixelRect(30, 22, 70, 51)
-SIZE = {"columns": 120, "rows": 90, "panel_columns": 120, "panel_rows": 90}
 
 
-def shown(to: Any = (1.0, 1.0, 0.0, 0.0), push: Any = (0.0, 0.0, 0.0, 0.0), **size: int) -> ShownPanel:
-    return ShownPanel(source_from_panel=ScaleShift(*to), push=ScaleShift(*push), **{**SIZE, **size})
+def shown(
+    to: Any = (1.0, 1.0, 0.0, 0.0), push: Any = (0.0, 0.0, 0.0, 0.0), *, columns: int = 120, rows: int = 90
+) -> ShownPicture:
+    screen = np.zeros((rows, columns, 4), np.uint8)
+    return ShownPicture(screen, screen, source_from_panel=to, push=push, panel_px=(90, 120))
 
 
 scales, shifts = st.floats(0.5, 2.0), st.floats(-30, 30)
