@@ -452,7 +452,7 @@ Problem::Problem(const Panels &given, bool closing, std::shared_ptr<const Rays> 
           "a homography is not finite");
   const Panels::Roles roles = closing ? Panels::Roles{given.ahead, given.last, given.moved, given.last} : given.roles();
   for (int n = 0; n < panels; ++n) {
-    const auto [rows, columns] = boxes[n];
+    const int rows = boxes[n].first, columns = boxes[n].second;
     require(rows >= 1 && columns >= 1 && rows <= given.rows && columns <= given.columns, "a box is larger than its panel");
     const auto image = [&](int buffer) { return Image{given.row(buffer, n, 0), given.stride, rows, columns, rows}; };
     panel[n] = {image(roles.ahead), image(roles.moved), image(roles.before), image(roles.last)};
