@@ -62,9 +62,9 @@ secrets: $(VENV)/.test
 coverage: $(VENV)/.test
 	$(BIN)/python -m pytest -m "not slow" -n $(TEST_WORKERS) --dist loadfile --cov --cov-report=term:skip-covered --cov-report=html:out/coverage
 
-# Checks that take too long for every change: the slow tests, coverage, every fuzzer, secrets in all files, other
+# Checks that take too long for every change: the slow tests, coverage, every fuzzer, sanitizers, secrets in all files, other
 # mutations each night, and the frontier against the night before (exit 1 if slower or worse beyond noise).
-nightly: test-slow coverage fuzz secrets
+nightly: test-slow coverage fuzz sanitize secrets
 	for room in frame eyes optics model panels content calib kernels; do \
 	  $(BIN)/python -m tests.mutate $$room --count 20 --seed $$(date +%j) || exit 1; done
 	mkdir -p $(NIGHTLY)
