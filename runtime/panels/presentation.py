@@ -233,6 +233,7 @@ class Painter:
             table = np.ascontiguousarray(mount.curve.T)
             self._curve = context.texture((lut.ENTRIES, 3), 1, table.tobytes(), dtype="f4")
             self._curve.filter = (moderngl.LINEAR, moderngl.LINEAR)
+            self._curve.repeat_x = self._curve.repeat_y = False  # some drivers round weights at white to more than 0
         fixed = {
             "solved": 0, "flat_picture": 1, "curve": 2, "relief": 3,
             "screen_px": tuple(map(float, mount.screen_px)),
