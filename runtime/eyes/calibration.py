@@ -153,19 +153,15 @@ def check_similarity(matrix: F64, *, source: str | Path) -> None:
             name,
             f"must be a rotation times a single scale to within {SIMILARITY_TOLERANCE}, but is off by {defect:.2g}",
         )
-    largest = float(np.abs(matrix[:3, :3]).max())
-    volume = float(np.linalg.det(matrix[:3, :3] / largest))
-    if volume <= 0.0:
-        raise InputError(
-            source, name, "mirrors space (its determinant is not positive); check the directions of the axes"
-        )
-    scale = largest * float(np.cbrt(volume))  # without scaling, the determinant could overflow
+    scale = float(np.linalg.norm(matrix[:3, :3])) / 3**0.5
     if not SCALE[0] <= scale <= SCALE[1]:
         raise InputError(
             source,
             name,
             f"has a scale of {scale:.3g}, but the scale must be about 1; check that both frames are in metres",
         )
+    if np.linalg.det(matrix[:3, :3]) < 0.0:
+        raise InputError(source, name, "mirrors space (its determinant is negative); check the directions of the axes")
     distance_m = float(np.linalg.norm(matrix[:3, 3]))
     if distance_m > MAX_DISTANCE_M:
         problem = f"places the sensor {distance_m:.4g} m from the display, but the maximum is {MAX_DISTANCE_M:g} m"

@@ -275,7 +275,7 @@ class PupilFinder:
 
     def _remember(self, picture: U8, look: _Look, eyes: F64) -> None:
         looks = look.looks if self._looks is None else self._looks + LOOKS_PULL * (look.looks - self._looks)
-        self._looks = looks / np.linalg.norm(looks)
+        self._looks = _unit(looks)
         self._last, self._eyes = look, eyes
         self._flow.remember(picture, look.mesh, look.eye_distance)
 
@@ -312,9 +312,13 @@ def _looks(picture: U8, mesh: F64, eye_distance: float) -> F64:
     x, y = (mesh[:, :2] - [x0 + 0.5, y0 + 0.5]).astype(np.float32).T
     values = cv2.remap(grey, x[:, None], y[:, None], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     looks = values.ravel().astype(np.float64)
-    looks -= looks.mean()
-    result: F64 = looks / max(float(np.linalg.norm(looks)), 1e-9)
-    return result
+    return _unit(looks - looks.mean())
+
+
+def _unit(looks: F64) -> F64:
+    """Return looks of norm 1, or zeros where a face has no contrast."""
+    unit: F64 = looks / max(float(np.linalg.norm(looks)), 1e-9)
+    return unit
 
 
 def _similarity(last: F64, mesh: F64) -> F64:

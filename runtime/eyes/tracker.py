@@ -44,7 +44,6 @@ ESTABLISHED = 3  # a head with fewer samples than this may be a mistake
 SIGMA_AHEAD_S = imm.LONGEST_S  # uncertainty is extrapolated no further than this
 NEAREST_M = 0.1  # minimum distance from the display to use when weighing depth errors
 PANEL_M = (0.5184, 0.2916)  # default panel width and height
-NO_JUMP = np.zeros((2, 3))
 # The filtered quantities: the midpoint of the eyes and the vector from the midpoint to the right eye.
 MODELS = imm.Models.of(ACCELERATION, TURN_ACCELERATION, stay_s=STAY_S)
 HEAD_FROM_EYES = np.array([[0.5, 0.5], [-0.5, 0.5]])
@@ -117,13 +116,13 @@ class _Shown:
     """The viewer's head after a sample, with a jump that is still being smoothed out."""
 
     head: _Head
-    jump_m: F64  # (2, 3) vectors from the measured to the last shown eyes at `jump_ns`; they decay from then on
+    jump_m: F64 | None  # (2, 3) vectors from the measured to the last shown eyes at `jump_ns`; they decay from then on
     jump_ns: int
 
     def eyes_m(self, ahead_s: float, time_ns: int) -> F64:
         """Return the (2, 3) eyes, predicted `ahead_s` after the newest sample, and the rest of a jump."""
         eyes = self.head.eyes_m(ahead_s)
-        if self.jump_m is not NO_JUMP:
+        if self.jump_m is not None:
             fraction = min(max((time_ns - self.jump_ns) / NS_PER_S / REVIVE_S, 0.0), 1.0)
             eyes += self.jump_m * (1 - fraction * fraction * (3 - 2 * fraction))
         return eyes
@@ -282,11 +281,11 @@ class Tracker:
 
     def _follow(self, head: _Head, *, is_return: bool = False) -> None:
         """Make `head` the viewer's; after a loss or a jump, the position blends from the last one shown."""
-        jump_m, jump_ns = (self._history[-1].jump_m, self._history[-1].jump_ns) if self._history else (NO_JUMP, 0)
+        jump_m, jump_ns = (self._history[-1].jump_m, self._history[-1].jump_ns) if self._history else (None, 0)
         if is_return:
             jump_ns = max(self._asked_ns, head.capture_ns)
             before = self.at(jump_ns).eyes_m
-            jump_m = NO_JUMP if before is None else before - head.eyes_m(min(head.age_s(jump_ns), HORIZON_S))
+            jump_m = None if before is None else before - head.eyes_m(min(head.age_s(jump_ns), HORIZON_S))
         self._history.append(_Shown(head, jump_m, jump_ns))
         self._lost_ns = None
         if self._other is not None and (self._other.may_be_viewer or is_return):

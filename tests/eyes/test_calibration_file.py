@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,14 @@ PUBLISHED = """stack_from_sensor = [
     [0.699976, 2.09768, 7.81822, -1.90611], [8.09414, -0.276962, -0.650369, 0.166057],
     [0.0985957, 7.8446, -2.11359, 3.31142], [0, 0, 0, 1]]
 """
+C, S = np.cos(np.deg2rad(10)), np.sin(np.deg2rad(10))
+DEMO_TURN = np.array([[0.0, -S, C], [-1.0, 0.0, 0.0], [0.0, -C, -S]])
+
+
+def similarity(scale: float = 1.0, away_m: float = 0.0) -> np.ndarray:
+    matrix = np.diag([scale, scale, scale, 1.0])
+    matrix[0, 3] = away_m
+    return matrix
 
 
 def toml(matrix: np.ndarray) -> str:
@@ -35,16 +44,16 @@ def refused(folder: Path, text: str) -> str:
 
 def test_the_demo_camera_is_tilted_down_by_ten_degrees() -> None:
     calibration = load_calibration(None)
-    c, s = np.cos(np.deg2rad(10)), np.sin(np.deg2rad(10))
-    turn = np.array([[0.0, -s, c], [-1.0, 0.0, 0.0], [0.0, -c, -s]])
-    np.testing.assert_array_equal(calibration.stack_from_sensor[:3, :3], turn)
+    np.testing.assert_array_equal(calibration.stack_from_sensor[:3, :3], DEMO_TURN)
     assert calibration.warnings == ()
 
 
 def test_eyes_keep_their_confidence_and_their_separation() -> None:
     eyes = EyePoints(np.array([[0.03, -0.05, 0.6], [-0.03, -0.05, 0.6]]), np.array([0.9, 0.4]), completed="right")
-    moved = load_calibration(None).apply(eyes)
-    assert moved.completed == "right"
+    assert load_calibration(None).apply(eyes).covariance_m2 is None
+    moved = load_calibration(None).apply(replace(eyes, covariance_m2=np.diag([1e-6, 4e-6, 9e-6])))
+    assert moved.completed == "right" and moved.covariance_m2 is not None
+    np.testing.assert_allclose(DEMO_TURN.T @ moved.covariance_m2 @ DEMO_TURN, np.diag([1e-6, 4e-6, 9e-6]), atol=1e-18)
     np.testing.assert_array_equal(moved.confidence, eyes.confidence)
     assert np.linalg.norm(moved.eyes_m[0] - moved.eyes_m[1]) == pytest.approx(0.06)
     assert moved.eyes_m[0][1] < moved.eyes_m[1][1], "the left eye is on the viewer's left"
@@ -89,7 +98,13 @@ def test_the_published_prototype_matrix_is_a_similarity_to_its_printed_digits(tm
 @pytest.mark.parametrize(
     ("text", "wanted"),
     [
-        *((toml(np.diag([scale, scale, scale, 1.0])), "stack_from_sensor") for scale in (1e200, 1e-200, 1e6, 1e-6)),
+        (toml(similarity(1e200)), "stack_from_sensor.0.0: Input should be less than or equal to 1000000000"),
+        *((toml(similarity(scale)), "must be about 1; check that") for scale in (1e-200, 1e6, 1e-6, 4.9e-4, 2010.0)),
+        *(
+            (toml(similarity(1.0, far)), f"{far:.4g} m from the display, but the maximum is 20 m")
+            for far in (20.1, 1e3)
+        ),
+        (toml(similarity(-1.0)), "mirrors space"),
         ("", "stack_from_sensor: is missing"),
         ("stack_from_sensor = [[1,", "malformed"),
         ("stack_from_sensor = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]", "stack_from_sensor"),
@@ -99,7 +114,7 @@ def test_the_published_prototype_matrix_is_a_similarity_to_its_printed_digits(tm
         (toml(np.eye(4)).replace("1.0", "inf", 1), "stack_from_sensor.0.0"),
         (toml(np.eye(4)).replace("1.0", '"1.0"', 1), "stack_from_sensor.0.0"),
         (toml(np.eye(4)).replace("1.0", "true", 1), "stack_from_sensor.0.0"),
-        (toml(np.diag([1.0, 1.0, 1.01, 1.0])), "rotation times a single scale"),
+        (toml(np.diag([1.0, 1.0, 1.00077, 1.0])), "to within 0.001, but is off by 0.001"),
         (toml(np.diag([0.0, 0.0, 0.0, 1.0])), "rotation times a single scale"),
         (toml(np.diag([1.0, 1.0, -1.0, 1.0])), "mirrors space"),
         (toml(np.eye(4) + np.eye(4)[[3, 0, 1, 2]] * [0.1, 0, 0, 0]), "rotation times a single scale"),
@@ -107,6 +122,7 @@ def test_the_published_prototype_matrix_is_a_similarity_to_its_printed_digits(tm
         (toml(np.eye(4)) + 'units = "mm"', "units"),
         (toml(np.eye(4)) + "[covariance]\npivot_m = [0, 0, 0]\nmatrix = [[1]]", "covariance.matrix.0"),
         (toml(np.eye(4)) + "[residuals]\nrms_m = -1", "residuals.rms_m"),
+        (toml(np.eye(4)) + "condition = inf", "condition"),
     ],
 )
 def test_a_wrong_file_is_refused_with_its_name_and_the_field(tmp_path: Path, text: str, wanted: str) -> None:
@@ -156,19 +172,16 @@ def test_the_error_at_the_eye_grows_with_the_distance_from_the_pairs(tmp_path: P
     assert load_calibration(None).position_error_m([[0.5, 0.0, 0.0]]) is None, "not known is not zero"
 
 
-@pytest.mark.parametrize("scale", [1e3, 1e-3])
-def test_millimetres_in_metres_are_only_warned_of(tmp_path: Path, scale: float) -> None:
-    (tmp_path / "c.toml").write_text(toml(np.diag([scale, scale, scale, 1.0])))
-    warning = load_calibration(tmp_path / "c.toml").warnings[0]
-    assert "far from 1" in warning and "millimetres" in warning
-
-
-def test_a_far_sensor_is_warned_of_and_a_kilometre_refused(tmp_path: Path) -> None:
-    def away(distance_m: float) -> str:
-        matrix = np.eye(4)
-        matrix[0, 3] = distance_m
-        return toml(matrix)
-
-    assert "1000 m from the display" in refused(tmp_path, away(1000.0))
-    (tmp_path / "c.toml").write_text(away(7.0))
-    assert "7 m from the display" in load_calibration(tmp_path / "c.toml").warnings[0]
+@pytest.mark.parametrize(("matrix", "warning"), [
+    *((similarity(scale), "far from 1; check that both frames are in metres")
+      for scale in (5.1e-4, 7.9e-4, 1.26e-3, 0.79, 1.26, 790.0, 1260.0, 1990.0)),
+    *((similarity(scale), "far from 1; one side appears to be in millimetres")
+      for scale in (8.1e-4, 1e-3, 1.24e-3, 810.0, 1e3, 1240.0)),
+    *((similarity(1.0, away), f"{away} m from the display; check this distance") for away in (5.01, 7.5, 19.9)),
+    *((matrix, "") for matrix in (similarity(0.81), similarity(1.24), similarity(1.0, 4.99))),
+    (np.diag([1.0, 1.0, 1.00074, 1.0]), ""),
+])  # fmt: skip
+def test_a_doubtful_scale_or_distance_is_only_warned_of(tmp_path: Path, matrix: np.ndarray, warning: str) -> None:
+    (tmp_path / "c.toml").write_text(toml(matrix))
+    told = load_calibration(tmp_path / "c.toml").warnings
+    assert len(told) == bool(warning) and all(warning in line for line in told)

@@ -148,6 +148,23 @@ def test_pupils_are_averaged_unless_the_gaze_turns(
     assert turned.sigma_px == pytest.approx(sigma_px, abs=0.02)
 
 
+@pytest.mark.parametrize("apart", [60.0, 100.0])
+def test_looks_are_the_blurred_grey_values_at_the_mesh_s_points(film: Film, apart: float) -> None:
+    """A wave of w radians per pixel keeps exp(-s² w² / 2) of its height in a blur by s, a 16th of the separation."""
+    face, waves = Face(apart=apart), ((0.15, 0.1), (-0.05, 0.2))
+
+    def grey(x: F64, y: F64, blur_px: float = 0.0) -> F64:
+        return np.asarray(sum(60 * np.sin(u * x + v * y) * np.exp(-(u**2 + v**2) * blur_px**2 / 2) for u, v in waves))
+
+    columns, rows = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    film.networks.faces = (face,)
+    film.finder.find(np.repeat(np.rint(128 + grey(columns, rows)).astype(np.uint8)[..., None], 3, axis=2))
+    expected = grey(*face.mesh()[:, :2].T, blur_px=apart / 16)
+    expected -= expected.mean()
+    assert film.finder.sign is not None
+    np.testing.assert_allclose(film.finder.sign.looks, expected / np.linalg.norm(expected), atol=0.002)
+
+
 def test_averaged_pupils_move_with_the_face(film: Film) -> None:
     film.see(Face(), count=15)
     for face in (Face(x=323.5, y=238.0), Face(x=326.0, y=237.0, roll=0.05)):
@@ -217,7 +234,7 @@ def test_a_viewer_unseen_for_longer_than_the_lock_is_replaced(monkeypatch: pytes
     assert film.see(other) is not None and film.finder.viewer == 2 and film.finder.reason == ""
 
 
-@pytest.mark.parametrize(("apart", "chosen"), [(60, 0), (84, 0), (96, 1)])
+@pytest.mark.parametrize(("apart", "chosen"), [(60, 0), (84, 0), (85, 1)])
 def test_a_face_in_a_corner_must_be_twice_as_large(film: Film, apart: float, chosen: int) -> None:
     faces = Face(apart=40.0), Face(x=560.0, y=60.0, apart=apart, person=1)
     found = film.see(*faces)
@@ -231,6 +248,14 @@ def test_the_four_foremost_faces_are_examined(film: Film, dogs: int, is_found: b
     faces = [replace(dog, x=100.0 + 110 * n, person=n) for n in range(dogs)]
     found = film.see(*faces, Face(x=580.0, y=440.0, apart=20.0, person=9))
     assert (found is not None) == is_found and film.finder.reason == ("" if is_found else ANIMAL)
+
+
+@pytest.mark.parametrize(
+    ("x", "y"), [(-400.0, 240.0), (1100.0, 240.0), (320.0, -300.0), (320.0, 900.0), (640.0, 480.0)]
+)
+def test_a_face_at_the_edge_or_beyond_has_looks(film: Film, x: float, y: float) -> None:
+    assert film.see(Face(x=x, y=y)) is not None and film.finder.sign is not None
+    assert np.isfinite(film.finder.sign.looks).all()
 
 
 def test_faces_of_others_are_left_to_them(film: Film) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from runtime.eyes.motions import MOTIONS, Path, observe, path_of, true_eyes
+from runtime.eyes.motions import MOTIONS, Path, minimum_jerk, observe, path_of, true_eyes
 
 Row = tuple[float, float, float, float, float]  # seconds; midpoint x, y, z in m; how much higher the right eye is in mm
 ROWS: dict[str, list[Row]] = {
@@ -28,6 +28,13 @@ def test_the_viewer_is_in_place_apart_from_swaying(motion: str) -> None:
     np.testing.assert_allclose(eyes.mean(axis=1), rows[1:4].T, atol=0.0035)
     np.testing.assert_allclose(1000 * (eyes[:, 1] - eyes[:, 0])[:, 2], rows[4], atol=0.15)
     np.testing.assert_allclose(np.linalg.norm(eyes[:, 1] - eyes[:, 0], axis=1), 0.063)
+
+
+def test_a_movement_of_minimum_jerk_starts_and_ends_at_rest() -> None:
+    places = minimum_jerk(
+        np.array([-1.0, 1.0, 1.5, 2.0, 3.0, 9.0]), knots_s=np.array([1.0, 3.0]), values=np.array([2.0, 4.0])
+    )
+    np.testing.assert_allclose(places, [2.0, 2.0, 2.20703125, 3.0, 4.0, 4.0])
 
 
 def test_a_path_starts_elsewhere_at_another_pace_size_and_side() -> None:

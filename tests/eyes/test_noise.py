@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from runtime.eyes import motions
-from runtime.eyes.noise import FEWEST, KEPT, LEAST_M, NoiseWatch
+from runtime.eyes.noise import NoiseWatch
 from runtime.eyes.tracker import HEAD_FROM_EYES
 
 
@@ -39,21 +39,30 @@ def test_motion_alone_counts_as_hardly_any_noise(motion: str) -> None:
     assert measured(motion, (0.0, 0.0, 0.0)).max() < 4e-4
 
 
-def test_nothing_is_known_before_enough_samples_and_after_gaps() -> None:
+@pytest.mark.parametrize(("count", "period_ms", "is_known"), [
+    (19, 30, False), (20, 30, True), (100, 99, True), (100, 101, False), (100, 200, False), (100, -30, False),
+])  # fmt: skip
+def test_noise_is_known_from_twenty_samples_without_gaps(count: int, period_ms: int, is_known: bool) -> None:
     watch = NoiseWatch()
-    for k in range(FEWEST):
-        watch.add(np.zeros((2, 3)), capture_ns=k * 30_000_000)
-    assert watch.sigma_m is None
-    slow = NoiseWatch()
-    for k in range(100):
-        slow.add(np.zeros((2, 3)), capture_ns=k * 200_000_000)
-    assert slow.sigma_m is None
+    for k in range(count):
+        watch.add(np.zeros((2, 3)), capture_ns=10**10 + k * period_ms * 1_000_000)
+    assert (watch.sigma_m is not None) == is_known
+
+
+def test_noise_is_that_of_the_newest_64_differences_and_renewed_with_every_fourth() -> None:
+    watch, random, told_m = NoiseWatch(), np.random.default_rng(0), []
+    for k in range(144):
+        watch.add(random.normal(0.0, 0.001, (2, 3)) if k < 100 else np.zeros((2, 3)), capture_ns=k * 30_000_000)
+        told_m.append(None if watch.sigma_m is None else float(watch.sigma_m.max()))
+    changes = [k for k in range(1, 120) if told_m[k] != told_m[k - 1]]
+    assert changes[0] == 19 and len(changes) > 12 and {k % 4 for k in changes} == {3}
+    assert (told_m[131] or 0.0) > 2e-4 and told_m[143] == 1e-4
 
 
 @given(scale=st.floats(1e-4, 1e-1), seed=st.integers(0, 10))
 def test_measured_noise_is_proportional_to_actual_noise_and_has_a_floor(scale: float, seed: int) -> None:
     random = np.random.default_rng(seed)
-    samples = random.normal(0.0, 1.0, (KEPT + 10, 2, 3))
+    samples = random.normal(0.0, 1.0, (74, 2, 3))
     watches = NoiseWatch(), NoiseWatch()
     for k, sample in enumerate(samples):
         for watch, size in zip(watches, (scale, 1e-6), strict=True):
@@ -61,4 +70,4 @@ def test_measured_noise_is_proportional_to_actual_noise_and_has_a_floor(scale: f
     assert watches[0].sigma_m is not None
     assert ((0.8 * scale < watches[0].sigma_m) & (watches[0].sigma_m < 2.5 * scale)).all()
     assert watches[1].sigma_m is not None
-    assert (watches[1].sigma_m == LEAST_M).all()
+    assert watches[1].sigma_m.tolist() == [1e-4] * 3

@@ -83,14 +83,16 @@ def test_hiding_and_missing_faces_never_confuse_two_people(data: st.DataObject) 
     assert all(len(owner) == 1 for owner in owners(shown, join_s=0.2).values())
 
 
-def test_a_head_that_may_be_either_person_is_given_to_nobody() -> None:
-    distance_m, radius_m = np.array([[0.10], [0.11]]), np.full((2, 1), 0.3)
-    assert assigned(distance_m, radius_m) == ([None, None], [True, True])
-
-
-def test_a_head_is_given_to_the_person_who_was_just_there() -> None:
-    distance_m, radius_m = np.array([[0.002], [0.11]]), np.array([[0.03], [0.3]])
-    assert assigned(distance_m, radius_m) == ([0, None], [False, False])
+@pytest.mark.parametrize(("distance_m", "radius_m", "heads", "doubt"), [
+    ((0.10, 0.11), (0.3, 0.3), [None, None], True), ((0.002, 0.11), (0.03, 0.3), [0, None], False),
+    ((0.0, 0.25), (0.2, 0.3), [None, None], True), ((0.0, 0.26), (0.2, 0.3), [0, None], False),
+    ((0.25, 0.6), (0.25, 0.5), [0, None], False),  # as far as the first can have come
+])  # fmt: skip
+def test_a_head_that_may_be_either_person_s_is_given_to_nobody(
+    distance_m: tuple[float, float], radius_m: tuple[float, float], heads: list[int | None], doubt: bool
+) -> None:
+    """The squared distances in thirds of the radius, plus six times their logarithms, must differ by nine."""
+    assert assigned(np.array([distance_m]).T, np.array([radius_m]).T) == (heads, [doubt] * 2)
 
 
 @given(st.permutations(range(3)), st.lists(st.floats(0.0, 0.03), min_size=3, max_size=3))
@@ -245,7 +247,7 @@ def test_the_nearest_who_waits_long_enough_is_taken_next() -> None:
 @pytest.mark.parametrize("heads", [(A,), (A, B)])
 def test_each_person_s_rest_is_watched(heads: tuple[EyePoints, ...]) -> None:
     crowd = People(Tracker, lambda: RestWatch(max_drift_m=0.001), most_served=2, join_s=0.1, in_front_m=0.07)
-    fed(crowd, *heads, seconds=1.3)
+    fed(crowd, *heads, seconds=31 / RATE_HZ)  # a second, from the first sample on
     rests = [person.rest for person in crowd.served]
     for one, rest in zip(heads, rests, strict=True):
         assert rest is not None and rest.place is not None

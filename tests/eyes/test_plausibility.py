@@ -85,9 +85,11 @@ def test_peoples_eyes_are_between_50_and_78_millimetres_apart(apart_mm: float, r
     assert p.reason_against(EYES * [1, apart_mm / 62, 1]) == reason
 
 
-@pytest.mark.parametrize(("distance_m", "reason"), [(19.9, ""), (20.1, p.TOO_DISTANT)])
-def test_no_viewer_is_farther_than_20_metres(distance_m: float, reason: str) -> None:
-    assert p.reason_against(EYES * [0, 1, 0] + [distance_m, 0, 0]) == reason
+@pytest.mark.parametrize(("place_m", "reason"), [
+    ((19.9, 0, 0), ""), ((20.1, 0, 0), p.TOO_DISTANT), ((12, 12, 10.5), ""), ((12, -12, 10.8), p.TOO_DISTANT),
+])  # fmt: skip
+def test_no_viewer_is_farther_than_20_metres(place_m: tuple[float, float, float], reason: str) -> None:
+    assert p.reason_against(EYES * [0, 1, 0] + place_m) == reason
 
 
 def test_a_mistake_is_told_after_ten_samples_and_in_more_than_half() -> None:

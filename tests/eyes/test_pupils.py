@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import skimage.data
 
-from runtime.eyes.networks import MODELS, FaceNetwork
+from runtime.eyes.networks import MODELS, FaceNetwork, resampled
 from runtime.eyes.pupils import PupilFinder, find_eyes
 from tests.eyes.scene import Portrait, camera, eileen, grace, scene
 
@@ -171,6 +171,26 @@ def test_a_face_on_the_wall_is_not_taken_again_unless_it_moves() -> None:
     assert found is None and finder.reason == "a face that neither moves nor blinks"
     moved = scene(np.array([-0.40, 0.0, 1.4]), intrinsics=CAMERA, portraits=(grace(),))[0]
     assert finder.find(moved, time_ns=76 * 200_000_000) is not None
+
+
+@pytest.mark.parametrize(("scale", "centre", "off"), [
+    (1.0, (60.0, 40.0), 1.0), (0.9, (5.0, 75.0), 1.0), (1.6, (118.0, 3.0), 1.0), (1.0, (400.0, 40.0), 1.0),
+    (1.0, (60.0, -300.0), 1.0), (0.4, (60.0, 40.0), 4.0), (0.25, (10.0, 300.0), 4.0),
+])  # fmt: skip
+def test_a_crop_is_the_turned_picture_with_its_edge_repeated(
+    scale: float, centre: tuple[float, float], off: float
+) -> None:
+    def wave(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return np.asarray(128 + 100 * np.sin(x / 25) * np.cos(y / 30))
+
+    rows, columns = np.mgrid[0:80, 0:120] + 0.5
+    picture = np.repeat(np.rint(wave(columns, rows)).astype(np.uint8)[..., None], 3, axis=2)
+    turn = scale * np.array([[0.8, -0.6], [0.6, 0.8]])
+    matrix = np.column_stack([turn, [20.0, 16.0] - turn @ centre])
+    v, u = np.mgrid[0:32, 0:40] + 0.5
+    x, y = np.linalg.inv(turn) @ (np.stack([u.ravel(), v.ravel()]) - matrix[:, 2:])
+    expected = wave(np.clip(x, 0.5, 119.5), np.clip(y, 0.5, 79.5)).reshape(32, 40)
+    assert np.abs(resampled(picture, (40, 32), matrix)[..., 1] - expected).max() < off + 0.6
 
 
 def test_a_large_picture_is_reduced_before_faces_are_searched() -> None:

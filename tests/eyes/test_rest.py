@@ -87,6 +87,35 @@ def rested(eyes: np.ndarray = EYES, *, count: int = 60, noise_m: float = 0.0) ->
     return watch
 
 
+@pytest.mark.parametrize("rate_hz", [29, 30])
+def test_a_head_comes_to_rest_at_the_median_of_the_last_second(rate_hz: int) -> None:
+    samples, watch = EYES + np.random.default_rng(0).normal(0.0, 0.001, (90, 2, 3)), RestWatch(max_drift_m=MOST_M)
+    newest = -1
+    while watch.place is None:
+        newest += 1
+        watch.update(samples[newest], capture_ns=newest * NS_PER_S // rate_hz)
+    np.testing.assert_allclose(watch.place, np.median(samples[newest - rate_hz : newest + 1], axis=0), atol=1e-15)
+
+
+def test_a_shift_within_the_noise_is_followed_when_it_has_lasted_half_of_three_seconds() -> None:
+    random, watch, places = np.random.default_rng(1), RestWatch(max_drift_m=MOST_M), []
+    for number in range(360):
+        aside = np.array([0.0, 0.004 if number >= 180 else 0.0, 0.0])
+        watch.update(EYES + aside + random.normal(0.0, 0.002, (2, 3)), capture_ns=number * NS_PER_S // 30)
+        places.append(watch.place)
+    changes = [number for number in range(60, 360) if places[number] is not places[number - 1]]
+    assert len(changes) == 1 and 45 < changes[0] - 180 < 55
+
+
+def test_noise_is_that_of_the_newest_128_samples() -> None:
+    watch, random, told_m = RestWatch(max_drift_m=MOST_M), np.random.default_rng(0), []
+    for number in range(240):
+        noise_m = random.normal(0.0, 0.001, (2, 3)) if number < 160 else 0.0
+        watch.update(EYES + noise_m, capture_ns=number * NS_PER_S // 30)
+        told_m.append(watch.noise_m.max())
+    assert told_m[223] > 5e-5 and told_m[231] < 1e-9  # once more than half of them have none
+
+
 NEWEST_NS = 59 * NS_PER_S // 30
 
 
