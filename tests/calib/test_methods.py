@@ -79,8 +79,7 @@ def test_the_predicted_error_at_the_eye_is_the_real_one(method: str) -> None:
 def test_pairs_without_any_noise_leave_no_uncertainty() -> None:
     corners = np.array(list(product((-1.0, 1.0), repeat=3)))
     found = solve_default(corners, corners)
-    assert found.noise_m == 0.0
-    assert found.unit_covariance[6, 6] == 0.0
+    assert found.noise_m == 0.0 and found.unit_covariance[6, 6] == 0.0
 
 
 @pytest.mark.parametrize("fixed_scale", [False, True])

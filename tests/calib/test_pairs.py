@@ -34,29 +34,21 @@ def test_json_gives_the_same_as_csv(tmp_path: Path, wrapped: bool) -> None:
     np.testing.assert_array_equal(from_json.stack_m, from_csv.stack_m)
 
 
-@pytest.mark.parametrize(
-    ("name", "text", "wanted"),
-    [
-        ("p.csv", "", "sensor_x: the column is missing"),
-        ("p.csv", "a,b\n1,2\n", "sensor_x: the column is missing"),
-        ("p.csv", HEADER + "\n1,2,3,4,5\n", "line 2, stack_z: is missing"),
-        ("p.csv", HEADER + "\n1,2,3,4,5,6\n1,nan,3,4,5,6\n", "line 3, sensor_y: is not finite"),
-        ("p.csv", HEADER + "\n1,2,3,4,5,1e999\n", "line 2, stack_z: is not finite"),
-        ("p.csv", HEADER + "\n1,2,3,4,5,1e200\n", r"line 2, stack_z: exceeds 1e\+09: '?1e200"),
-        ("p.csv", HEADER + "\n1,2,three,4,5,6\n", "line 2, sensor_z: is not a number: '?three"),
-        ("p.json", "{", "malformed"),
-        ("p.json", "3", "must be a list"),
-        ("p.json", "[1]", "must be a list of objects"),
-        ("p.json", '[{"sensor_x": 1}]', "sensor_y: the column is missing"),
-        (
-            "p.csv",
-            HEADER + "\n,2,x,4,5,6\n1,2,3,4,5,nan\n1,2,3,4,5,inf\n",
-            "line 2, sensor_x: is missing; line 2, sensor_z: is not a number: x; line 3, stack_z: is not finite: "
-            "nan; and 1 more",
-        ),
-        ("p.json", json.dumps([dict.fromkeys(COLUMNS, True)]), "pair 1, sensor_x: is not a number"),
-    ],
-)
+@pytest.mark.parametrize(("name", "text", "wanted"), [
+    *(("p.csv", text, "sensor_x: the column is missing") for text in ("", "a,b\n1,2\n")),
+    ("p.csv", HEADER + "\n1,2,3,4,5\n", "line 2, stack_z: is missing"),
+    ("p.csv", HEADER + "\n1,2,3,4,5,6\n1,nan,3,4,5,6\n", "line 3, sensor_y: is not finite"),
+    ("p.csv", HEADER + "\n1,2,3,4,5,1e999\n", "line 2, stack_z: is not finite"),
+    ("p.csv", HEADER + "\n1,2,3,4,5,1e200\n", r"line 2, stack_z: exceeds 1e\+09: '?1e200"),
+    ("p.csv", HEADER + "\n1,2,three,4,5,6\n", "line 2, sensor_z: is not a number: '?three"),
+    ("p.json", "{", "malformed"),
+    ("p.json", "3", "must be a list"),
+    ("p.json", "[1]", "must be a list of objects"),
+    ("p.json", '[{"sensor_x": 1}]', "sensor_y: the column is missing"),
+    ("p.csv", HEADER + "\n,2,x,4,5,6\n1,2,3,4,5,nan\n1,2,3,4,5,inf\n", "line 2, sensor_x: is missing; line 2, "
+     "sensor_z: is not a number: x; line 3, stack_z: is not finite: nan; and 1 more"),
+    ("p.json", json.dumps([dict.fromkeys(COLUMNS, True)]), "pair 1, sensor_x: is not a number"),
+])  # fmt: skip
 def test_a_wrong_file_is_refused_with_its_place(tmp_path: Path, name: str, text: str, wanted: str) -> None:
     path = file(tmp_path, text, name)
     with pytest.raises(InputError, match=wanted) as caught:

@@ -31,18 +31,14 @@ def register(seen: Any, *, stack: PanelStack = STACK) -> Any:
 
 @pytest.mark.slow
 def test_a_dozen_stacks_are_found_to_a_tenth_of_a_pixel() -> None:
-    errors, inside = [], []
+    errors = []
     for seed in range(12):
         truth, random = hands(seed)
-        seen = photographed(STACK, truth, count=12, noise_px=0.15, random=random)
-        error = errors_of(register(seen), truth)
-        errors.append(error)
-        inside.append(error.inside_95)
+        errors.append(errors_of(register(photographed(STACK, truth, count=12, noise_px=0.15, random=random)), truth))
     pixels = np.concatenate([error.pixels for error in errors])
-    assert np.sqrt((pixels**2).mean()) < 0.1
-    assert pixels.max() < 0.3
+    assert np.sqrt((pixels**2).mean()) < 0.1 and pixels.max() < 0.3
     assert np.abs([error.gap_m for error in errors]).max() < 0.2e-3
-    assert 0.90 <= np.concatenate(inside).mean() <= 0.99
+    assert 0.90 <= np.concatenate([error.inside_95 for error in errors]).mean() <= 0.99
 
 
 def test_gross_errors_among_the_points_do_no_harm() -> None:
@@ -72,9 +68,8 @@ def test_too_few_photographs_are_refused_with_what_is_wrong_with_the_others() ->
 
 def test_photographs_from_one_place_are_refused() -> None:
     truth, random = hands(0)
-    poses = [
-        camera_from_stack(np.array([0.6, *random.normal(scale=0.02, size=2)]), towards_m=np.zeros(3)) for _ in range(8)
-    ]
+    places = [np.array([0.6, *random.normal(scale=0.02, size=2)]) for _ in range(8)]
+    poses = [camera_from_stack(place, towards_m=np.zeros(3)) for place in places]
     seen = photographed(STACK, truth, count=8, noise_px=0.05, random=random, poses=poses)
     with pytest.raises(Undetermined, match="directions span only"):
         register(seen)

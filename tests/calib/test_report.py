@@ -27,13 +27,11 @@ def calibration(tmp_path: Path) -> Path:
 def test_the_page_holds_numbers_and_pictures_and_needs_nothing_else(tmp_path: Path, calibration: Path) -> None:
     out = tmp_path / "deep" / "report"
     told = answered(app, "report", calibration, "--out", out)
-    assert told["points"] == 27
-    assert told["rejected"] == 1
+    assert told["points"] == 27 and told["rejected"] == 1
     page = (out / "index.html").read_text()
     assert page.count("data:image/png;base64,") == 1
     assert not re.search(r"(src|href)=\"(?!data:|#)", page)
-    for text in ("rms_mm", "robust", "condition", "eye_error_mm", "line 7", "rejected"):
-        assert text in page
+    assert all(text in page for text in ("rms_mm", "robust", "condition", "eye_error_mm", "line 7", "rejected"))
     assert read_image(out / "residuals.png").std() > 5
 
 
@@ -42,25 +40,19 @@ def test_the_published_prototype_is_reported_without_its_points(tmp_path: Path) 
     path.write_text(PUBLISHED)
     told = answered(app, "report", path, "--out", tmp_path / "r")
     assert told["scale"] == pytest.approx(8.125, abs=1e-3)
-    assert told["similarity_defect"] < 2e-6
-    assert told["eye_error_mm"] is None
+    assert told["similarity_defect"] < 2e-6 and told["eye_error_mm"] is None
     page = (tmp_path / "r" / "index.html").read_text()
-    assert "far from 1" in page
-    assert "contains no pairs" in page
+    assert "far from 1" in page and "contains no pairs" in page
 
 
-@pytest.mark.parametrize(
-    ("data", "told"),
-    [
-        ("sensor_m = [[1, 2]]\nstack_m = [[1, 2, 3]]\nused = [true]\nnames = ['a']", "data"),
-        ("sensor_m = [[1, 2, 3]]\nstack_m = [[1, 2, 3]]\nused = [true, true]\nnames = ['a']", "data.*differ in length"),
-        ("sensor_m = [[1, 2, 3]]\nstack_m = [[1, 2, 3]]\nused = [false]\nnames = ['a']", "data.*true for no pair"),
-        ("sensor_m = [[1, 2, nan]]\nstack_m = [[1, 2, 3]]\nused = [true]\nnames = ['a']", "data"),
-    ],
-)
-def test_spoiled_points_are_refused_and_nothing_is_written(tmp_path: Path, data: str, told: str) -> None:
+@pytest.mark.parametrize(("sensor_m", "used", "told"), [
+    ("[1, 2]", "true", "data"), ("[1, 2, 3]", "true, true", "data.*differ in length"),
+    ("[1, 2, 3]", "false", "data.*true for no pair"), ("[1, 2, nan]", "true", "data"),
+])  # fmt: skip
+def test_spoiled_points_are_refused_and_nothing_is_written(tmp_path: Path, sensor_m: str, used: str, told: str) -> None:
     path = tmp_path / "c.toml"
-    path.write_text(PUBLISHED + "[data]\n" + data + "\n")
+    data = f"sensor_m = [{sensor_m}]\nstack_m = [[1, 2, 3]]\nused = [{used}]\nnames = ['a']\n"
+    path.write_text(f"{PUBLISHED}[data]\n{data}")
     with pytest.raises(InputError, match=told):
         answered(app, "report", path, "--out", tmp_path / "r")
     assert not (tmp_path / "r").exists()

@@ -82,14 +82,12 @@ def test_keys_alone_lead_from_nothing_to_a_configuration_that_is_valid(tmp_path:
     assert done.returncode == 0, done.stdout + done.stderr
     assert "not done:" not in done.stdout
     told = json.loads((folder / "out" / "setup.json").read_text())
-    assert told["finished"]
-    assert set(told["done"]) == {step.name for step in STEPS}
+    assert told["finished"] and set(told["done"]) == {step.name for step in STEPS}
     assert "expected error at the eye" in told["done"]["calibration"]["text"]
     settings = load_settings(folder / "new.toml")
     for index, panel in enumerate(settings.output.panels):
         monitor = hardware.order.index(index)
-        assert panel.edid_serial == f"S{monitor}"
-        assert (panel.rotation_deg, panel.mirror) == hardware.mounted[monitor]
+        assert (panel.edid_serial, panel.rotation_deg, panel.mirror) == (f"S{monitor}", *hardware.mounted[monitor])
     found = load_calibration(Path(settings.calibration.file)).stack_from_sensor
     eyes = np.array([viewpoint.midpoint_m for viewpoint in grid()])
     sensor = np.column_stack([eyes, np.ones(27)]) @ np.linalg.inv(demo_stack_from_sensor()).T
@@ -167,9 +165,8 @@ class FourMonitors(SimulatedHardware):
     shown: tuple[int, ...] = ()
 
     def monitors(self) -> tuple[Monitor, ...]:
-        return tuple(
-            Monitor(f"HDMI-{n}", serial, "", 100 * n, 0, 100, 50, 60.0) for n, serial in enumerate(("S", "T", "T", ""))
-        )
+        serials = enumerate(("S", "T", "T", ""))
+        return tuple(Monitor(f"HDMI-{n}", serial, "", 100 * n, 0, 100, 50, 60.0) for n, serial in serials)
 
     def show_card(self, number: int, words: Sequence[str]) -> None:
         self.shown = (*self.shown, number)
@@ -178,8 +175,7 @@ class FourMonitors(SimulatedHardware):
 def test_a_monitor_is_named_by_its_serial_and_keeps_its_settings(tmp_path: Path) -> None:
     taken = [Key.ACCEPT, Key.UP, Key.ACCEPT]
     keys = [Key.ACCEPT, Key.DOWN, Key.NEXT, *taken, Key.NEXT, *taken]
-    setup = scripted(tmp_path, [], keys, FourMonitors)
-    identify(setup)
+    identify(setup := scripted(tmp_path, [], keys, FourMonitors))
     assert setup.hardware.shown == (0, 0, 0, 1, 1, 1, 2, 3, 3, 3)
     config = tmp_path / "c.toml"
     config.write_text(config.read_text().replace('mirror = "', 'gamma = 2.0\nmirror = "'))
@@ -198,9 +194,7 @@ def test_progress_that_is_not_ours_is_refused(tmp_path: Path) -> None:
 
 def test_nothing_is_asked_of_a_terminal_that_is_closed(tmp_path: Path) -> None:
     done = setup_command(tmp_path, "", "--simulate")
-    assert done.returncode == 0
-    assert "not done: identify" in done.stdout
-    assert list(tmp_path.iterdir()) == []
+    assert done.returncode == 0 and "not done: identify" in done.stdout and list(tmp_path.iterdir()) == []
 
 
 def test_rewriting_a_configuration_widens_no_permission_and_keeps_links(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,10 @@ def screen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[xserver.XServer
     server = xserver.start_or_skip(tmp_path_factory.mktemp("xorg"))
     yield server
     server.stop()
+
+
+def shows(screen: xserver.XServer, panel: int, picture: np.ndarray) -> bool:
+    return np.array_equal(screen.panel(panel)[..., 0], picture)
 
 
 def test_keys_lead_through_cards_and_boards_on_the_panels(screen: xserver.XServer, tmp_path: Path) -> None:
@@ -61,23 +66,18 @@ def test_keys_lead_through_cards_and_boards_on_the_panels(screen: xserver.XServe
                 press("\n" + up + "\n")
             press("n\n\n")
             for monitor in range(3):
-                expected = board(STACK, monitor)
-                assert eventually(
-                    lambda monitor=monitor, expected=expected: np.array_equal(screen.panel(monitor)[..., 0], expected),
-                    within_s=60,
-                )
+                shown = partial(shows, screen, monitor, board(STACK, monitor))
+                assert eventually(shown, within_s=60)
             # The photographs exist but show no board, which is reported.
             output = running.communicate("\nq\n", timeout=120)[0]
         finally:
             running.kill()
-    assert running.returncode == 0
-    assert "failed:" in output
+    assert running.returncode == 0 and output.count("Step 3 of 7") == 2 and "failed:" in output
     assert "0 of 5 photographs are usable, but at least 5 are needed" in output
-    assert output.count("Step 3 of 7") == 2
     assert "not done: geometry, registration, grey, sensor, calibration, service" in output
     settings = load_settings(config)
-    assert [panel.connector for panel in settings.output.panels] == ["DUMMY0", "DUMMY1", "DUMMY2"]
-    assert settings.output.kind == "windows"
+    connectors = [panel.connector for panel in settings.output.panels]
+    assert settings.output.kind == "windows" and connectors == ["DUMMY0", "DUMMY1", "DUMMY2"]
     assert all(panel.homography[0][0] == 1.0 for panel in settings.output.panels)
 
 
@@ -101,9 +101,8 @@ def test_a_chart_is_shown_until_a_key_is_pressed_on_a_panel(screen: xserver.XSer
     environment = os.environ | {"DISPLAY": screen.name, "OMP_NUM_THREADS": "1"}
     with subprocess.Popen(command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL) as running:
         try:
-            assert eventually(lambda: np.array_equal(screen.panel(1)[..., 0], grey_chart(STACK, 1)), within_s=30)
-            assert not screen.panel(0).any()
-            assert not screen.panel(2).any()
+            assert eventually(partial(shows, screen, 1, grey_chart(STACK, 1)), within_s=30)
+            assert not screen.panel(0).any() and not screen.panel(2).any()
             press_q(screen)
             assert running.wait(timeout=60) == 0
         finally:

@@ -17,9 +17,10 @@ CAMERA = camera(640, 480, 65.0)
 PLACE = np.array([0.04, 0.02, 0.7])
 
 
-def test_eyes_are_found_in_space_to_some_millimetres_at_every_place() -> None:
+@pytest.mark.parametrize("depth_size", [None, (320, 240)])
+def test_eyes_are_found_in_space_to_some_millimetres_at_every_place(depth_size: tuple[int, int] | None) -> None:
     for place in ((0.0, 0.0, 0.4), (0.0, 0.0, 1.5), (0.1, 0.05, 0.6), (-0.25, -0.1, 0.9), (0.3, 0.1, 1.4)):
-        colour, depth, (truth,) = scene(np.array(place), intrinsics=CAMERA)
+        colour, depth, (truth,) = scene(np.array(place), intrinsics=CAMERA, depth_size=depth_size)
         finder = EyeFinder()
         for number in (1, 2, 3):
             found = finder.find(frame(colour, depth, CAMERA, number=number))
@@ -29,15 +30,6 @@ def test_eyes_are_found_in_space_to_some_millimetres_at_every_place() -> None:
         assert found.covariance_m2 is not None and finder.pupils is not None
         sigmas_px = np.sqrt(found.covariance_m2.diagonal()[:2]) / place[2] * CAMERA.fx_px / finder.pupils.sigma_px
         np.testing.assert_allclose(sigmas_px, [0.55, 1.1], rtol=0.02 if place[:2] == (0.0, 0.0) else 0.8)
-
-
-def test_depth_of_another_size_is_registered_by_scale() -> None:
-    colour, depth, (truth,) = scene(PLACE, intrinsics=CAMERA, depth_size=(320, 240))
-    assert np.abs(EyeFinder().find(frame(colour, depth, CAMERA)).eyes_m - truth).max() < 0.005
-
-
-def with_settings(**sections: dict) -> Settings:
-    return Settings.model_validate(sections)
 
 
 def faulty(depth: np.ndarray, seed: int, *, holes: float, flying: float, noise_mm: float) -> np.ndarray:
@@ -123,7 +115,7 @@ def test_depth_that_fits_no_person_gives_no_eyes_and_a_reason(depth_mm: int) -> 
 
 def test_without_depth_the_distance_is_as_good_as_eye_separations_are_alike() -> None:
     colour, _, (truth,) = scene(PLACE, intrinsics=CAMERA)
-    learnt, known = EyeFinder(), EyeFinder(with_settings(calibration={"ipd_m": IPD_M}))
+    learnt, known = EyeFinder(), EyeFinder(Settings.model_validate({"calibration": {"ipd_m": IPD_M}}))
     for number in range(20):
         eyes = [finder.find(frame(colour, None, CAMERA, number=number)) for finder in (learnt, known)]
     sigmas = [np.sqrt(found.covariance_m2[2, 2]) for found in eyes]

@@ -69,15 +69,10 @@ def test_the_command_makes_any_of_them(tmp_path: Path, rate_hz: int) -> None:
     assert np.median(off) < 1e-6  # without noise, measurements equal the truth, except outliers
 
 
-@pytest.mark.parametrize(
-    ("how", "names"),
-    [
-        (["--motion", "moonwalk"], "stop-and-go"),
-        (["--motion", "walk", "--images"], "--images"),
-        (["--seed", "3"], "--seed"),
-        (["--motion", "walk", "--seconds", "1e9"], "--seconds"),
-    ],
-)
+@pytest.mark.parametrize(("how", "names"), [
+    (["--motion", "moonwalk"], "stop-and-go"), (["--motion", "walk", "--images"], "--images"),
+    (["--seed", "3"], "--seed"), (["--motion", "walk", "--seconds", "1e9"], "--seconds"),
+])  # fmt: skip
 def test_what_makes_no_sense_is_refused_by_name_and_leaves_nothing(tmp_path: Path, how: list[str], names: str) -> None:
     answer = invoked(record, *how, "--out", tmp_path / "a.mcap")
     assert isinstance(answer.exception, InputError) and names in str(answer.exception)

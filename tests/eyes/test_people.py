@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -109,26 +111,18 @@ def test_the_nearest_is_served_at_once_and_a_second_after_a_wait() -> None:
     assert served.index([1, 2]) == pytest.approx(0.5 * RATE_HZ, abs=2)
 
 
-def test_whoever_is_served_keeps_the_place_from_somebody_nearer() -> None:
-    crowd = people(most_served=1)
-    fed(crowd, head(0.8, -0.2, 0.0), seconds=1.0)
-    assert fed(crowd, head(0.5, 0.2, 0.0), head(0.8, -0.2, 0.0), seconds=2.0, begin_s=1.0)[-1] == [1]
-    assert crowd.in_view == 2
-    (number,) = fed(crowd, head(0.5, 0.2, 0.0), seconds=1.0, begin_s=3.0)[-1]
-    assert number == 2  # the first has left
+A, B, FAR, NEAR = head(0.6, -0.2, 0.0), head(0.8, 0.3, 0.0), head(0.8, -0.2, 0.0), head(0.5, 0.2, 0.0)
+THREE = head(0.6, -0.3, 0.0), head(0.7, 0.0, 0.0), head(0.8, 0.3, 0.0)
 
 
-def test_the_second_is_served_alone_once_the_first_has_left() -> None:
-    crowd = people(join_s=0.2)
-    fed(crowd, head(0.6, -0.2, 0.0), head(0.8, 0.3, 0.0), seconds=1.0)
-    assert fed(crowd, head(0.8, 0.3, 0.0), seconds=1.0, begin_s=1.0)[-1] == [2]
-
-
-def test_a_third_person_waits_for_a_place() -> None:
-    three = head(0.6, -0.3, 0.0), head(0.7, 0.0, 0.0), head(0.8, 0.3, 0.0)
-    crowd = people(join_s=0.2)
-    assert fed(crowd, *three, seconds=2.0)[-1] == [1, 2]
-    assert fed(crowd, three[0], three[2], seconds=1.0, begin_s=2.0)[-1] == [1, 3]
+@pytest.mark.parametrize(("most_served", "stages"), [
+    (1, [((FAR,), [1]), ((NEAR, FAR), [1]), ((NEAR,), [2])]), (2, [((A, B), [1, 2]), ((B,), [2])]),
+    (2, [(THREE, [1, 2]), (THREE[::2], [1, 3])]), (2, [((A, head(1.2, 0.0, 0.0), head(0.9, 0.6, 0.0)), [1, 3])]),
+])  # fmt: skip
+def test_the_nearest_are_served_and_keep_the_place_until_they_have_left(most_served: int, stages: list[Any]) -> None:
+    crowd = people(most_served=most_served, join_s=0.2)
+    for number, (heads, served) in enumerate(stages):
+        assert fed(crowd, *heads, seconds=1.0, begin_s=1.0 * number)[-1] == served and crowd.in_view == len(heads)
 
 
 def test_one_mistaken_head_serves_nobody_else() -> None:
@@ -142,9 +136,6 @@ def test_two_samples_of_one_face_are_one_person() -> None:
     crowd = people(join_s=0.1)
     twice = head(0.6, -0.2, 0.0), head(0.64, -0.18, 0.0)
     assert fed(crowd, *twice, seconds=1.0)[-1] == [1] and crowd.in_view == 1
-
-
-A, B = head(0.6, -0.2, 0.0), head(0.8, 0.3, 0.0)
 
 
 @pytest.mark.parametrize(("lost_s", "away_m"), [(0.3, 0.1), (0.3, 0.75), (0.4, 0.95)])
@@ -236,12 +227,6 @@ def test_another_lone_viewer_has_another_number() -> None:
     assert fed(crowd, A, seconds=1.0)[-1] == [1] and crowd.in_view == 1
     served = fed(crowd, head(0.9, 1.5, 0.0), seconds=1.0, begin_s=1.0)
     assert served[0] == [1] and served[-1] == [2] and crowd.in_view == 1
-
-
-def test_the_nearest_who_waits_long_enough_is_taken_next() -> None:
-    crowd = people(join_s=0.5)
-    far, near = head(1.2, 0.0, 0.0), head(0.9, 0.6, 0.0)
-    assert fed(crowd, A, far, near, seconds=0.8)[-1] == [1, 3]
 
 
 @pytest.mark.parametrize("heads", [(A,), (A, B)])

@@ -41,10 +41,8 @@ def test_a_second_face_is_a_person_once_it_has_moved() -> None:
 
 
 def test_a_finder_of_one_ignores_the_others() -> None:
-    colour, depth, _ = scene(
-        np.array([-0.18, 0.0, 0.6]), np.array([0.2, 0.0, 0.7]), portraits=PEOPLE, intrinsics=CAMERA
-    )
-    sample = frame(colour, depth, CAMERA)
+    places = np.array([[-0.18, 0.0, 0.6], [0.2, 0.0, 0.7]])
+    sample = frame(*scene(*places, portraits=PEOPLE, intrinsics=CAMERA)[:2], CAMERA)
     finder = EyeFinder()
     (alone,) = finder.find_all(sample, is_still=True)
     finder.forget()

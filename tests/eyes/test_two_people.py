@@ -10,7 +10,7 @@ from runtime.records import F64
 
 Place = tuple[float, float, float]
 LEFT, RIGHT, AWAY = (0.62, -0.22, 0.0), (0.66, 0.22, 0.0), (np.nan,) * 3
-STANDING, WALKING_OFF = (0.96, 0.42, 0.35), (0.991, 0.604, 0.35)
+RISING, STANDING, WALKING_OFF = (0.81, 0.32, 0.175), (0.96, 0.42, 0.35), (0.991, 0.604, 0.35)
 SENSOR = np.array([0.05, 0.02, 0.22])
 PLACES: list[tuple[str, int, dict[float, Place]]] = [
     ("two-still", 0, {0.0: LEFT, 0.8: LEFT, 7.0: LEFT}),
@@ -26,14 +26,14 @@ PLACES: list[tuple[str, int, dict[float, Place]]] = [
     ("two-exchange", 0, {10.0: RIGHT, 11.0: (0.52, 0.0, 0.0), 12.0: LEFT, 16.0: LEFT, 18.0: RIGHT}),
     ("two-exchange", 1, {4.0: RIGHT, 5.0: (0.99, 0.0, 0.0), 6.0: LEFT, 10.0: LEFT, 12.0: RIGHT}),
     ("two-leave", 0, {0.0: LEFT, 5.0: LEFT, 10.6: LEFT}),
-    ("two-leave", 1, {0.0: RIGHT, 4.0: RIGHT, 4.5: (0.81, 0.32, 0.175), 5.0: STANDING, 5.4: WALKING_OFF, 6.6: AWAY}),
+    ("two-leave", 1, {0.0: RIGHT, 4.0: RIGHT, 4.5: RISING, 5.0: STANDING, 5.4: WALKING_OFF, 6.6: AWAY}),
     (
         "two-leave",
         1,
-        {8.0: AWAY, 9.2: WALKING_OFF, 9.6: STANDING, 10.1: (0.81, 0.32, 0.175), 10.6: RIGHT, 900.0: RIGHT},
+        {8.0: AWAY, 9.2: WALKING_OFF, 9.6: STANDING, 10.1: RISING, 10.6: RIGHT, 900.0: RIGHT},
     ),
     ("two-sit", 0, {0.0: LEFT, 3.6: LEFT, 4.6: LEFT}),
-    ("two-sit", 1, {0.0: AWAY, 2.0: AWAY, 3.2: WALKING_OFF, 3.6: STANDING, 4.1: (0.81, 0.32, 0.175), 4.6: RIGHT}),
+    ("two-sit", 1, {0.0: AWAY, 2.0: AWAY, 3.2: WALKING_OFF, 3.6: STANDING, 4.1: RISING, 4.6: RIGHT}),
 ]
 
 
