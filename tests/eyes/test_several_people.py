@@ -28,6 +28,10 @@ def test_two_people_are_found_nearest_first_with_left_and_right_eyes() -> None:
         people = EyeFinder(most_people=2).find_all(frame(colour, depth, CAMERA), is_still=True)
         for person, true_m in zip(people, reversed(truth), strict=True):  # the truth has the farthest first
             assert np.abs(person.eyes_m - true_m).max() < 0.006
+    finder = EyeFinder(most_people=2)
+    for places in ((near,), (near, far)):  # whoever comes in the next picture is found at once
+        colour, depth, _ = scene(*places, portraits=PEOPLE[: len(places)], intrinsics=CAMERA)
+        assert len(finder.find_all(frame(colour, depth, CAMERA, number=len(places)), is_still=True)) == len(places)
 
 
 def test_a_second_face_is_a_person_once_it_has_moved() -> None:
