@@ -143,7 +143,7 @@ def test_five_pairs_have_no_majority_and_six_have_one(count: int, left_out: list
 
 
 @pytest.mark.parametrize("count", [3, 4, 5, 6, 8, 12])
-def test_few_noisy_pairs_stay_and_one_that_is_5_cm_off_does_not(count: int) -> None:
+def test_few_noisy_pairs_stay_and_one_5_cm_off_does_not(count: int) -> None:
     """The half that agrees best is smaller than the noise, most of all if it is small."""
     left_out = stayed = 0
     for seed in range(40):

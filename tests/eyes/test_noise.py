@@ -45,7 +45,7 @@ def test_noise_is_known_from_twenty_samples_without_gaps(count: int, period_ms: 
     assert (watch.sigma_m is not None) == is_known
 
 
-def test_noise_is_that_of_the_newest_64_differences_and_renewed_with_every_fourth() -> None:
+def test_noise_of_the_newest_64_differences_is_renewed_with_every_fourth() -> None:
     watch, random, told_m = NoiseWatch(), np.random.default_rng(0), []
     for k in range(144):
         watch.add(random.normal(0.0, 0.001, (2, 3)) if k < 100 else np.zeros((2, 3)), capture_ns=k * 30_000_000)

@@ -151,7 +151,7 @@ def whose(**moves: bool) -> list[str]:
     return seen
 
 
-def test_a_face_on_the_wall_gives_way_to_a_person_who_alone_moves() -> None:
+def test_a_face_on_the_wall_gives_way_to_who_alone_moves() -> None:
     seen = whose(wall_moves=False, person_moves=True)
     assert seen[0] == "wall" and seen[30] == "wall" and set(seen[-25:]) == {"person"}
     assert set(whose(wall_moves=True, person_moves=True)) == {"wall"}

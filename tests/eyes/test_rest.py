@@ -93,7 +93,7 @@ def test_a_head_comes_to_rest_at_the_median_of_the_last_second(rate_hz: int) -> 
     np.testing.assert_allclose(watch.place, np.median(samples[newest - rate_hz : newest + 1], axis=0), atol=1e-15)
 
 
-def test_a_shift_within_the_noise_is_followed_when_it_has_lasted_most_of_two_seconds() -> None:
+def test_a_shift_within_the_noise_is_followed_after_almost_two_seconds() -> None:
     told = watched(12, noise_m=0.002, aside_m=lambda s: 0.004 * (s >= 6), seed=16)
     changes = [number for number in range(60, 360) if told[number][2] is not told[number - 1][2]]
     assert len(changes) == 1 and 45 < changes[0] - 180 < 60

@@ -443,7 +443,7 @@ def test_an_eye_that_was_filled_in_pulls_less() -> None:
 @pytest.mark.parametrize(
     ("lost_ms", "ms"), [*product([33], [40, 60, 90, 119]), *product([300], [300, 350, 390, 400, 410, 2000])]
 )
-def test_lost_eyes_move_on_until_the_loss_and_come_to_rest_within_400_ms(lost_ms: int, ms: int) -> None:
+def test_lost_eyes_come_to_rest_within_400_ms_of_their_sample(lost_ms: int, ms: int) -> None:
     tracker, last = fed(60, moving, hold_s=2.0)
     for told_ms in (lost_ms, lost_ms + 50):  # the first word of a loss counts
         tracker.update(None, capture_ns=last + told_ms * MS)
