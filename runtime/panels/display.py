@@ -231,7 +231,7 @@ def _has_gamma(monitor: Any) -> bool:
     except glfw.GLFWError:  # the driver has no table
         return False
     levels = np.array([ramp.red, ramp.green, ramp.blue])
-    return bool(levels.any() and np.abs(levels - np.linspace(0, 1, levels.shape[1])).max() > 1 / 255)
+    return bool(levels.any() and not np.allclose(levels, np.linspace(0, 1, levels.shape[1]), rtol=0, atol=1 / 255))
 
 
 def x_display() -> int:
