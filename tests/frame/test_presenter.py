@@ -194,7 +194,7 @@ def test_before_the_first_solution_the_flat_picture_is_shown_without_fading() ->
     stage = Stage()
     stage.solver.hand_over(flat=solution(1, None))
     (done,) = stage.refresh()
-    assert done.frame.flatness == 1.0
+    assert (done.frame.flatness, done.frame.solved_version, done.frame.flat_version) == (1.0, 0, 1)
     assert (done.account.inference, done.account.solution, done.account.presented) == ("skipped", None, True)
     stage.refresh(10)
     stage.solver.hand_over(solved=solution(2))
