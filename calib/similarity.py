@@ -27,7 +27,7 @@ EPSILON = float(np.finfo(np.float64).eps)
 ROTATION_BOUND_RAD = 1e-6  # rotation caused by rounding errors above which points are refused
 STARTS = 120  # number of random subsets to start from
 START_PAIRS = 4  # number of pairs in each subset
-FITS = 5  # number of fits from each subset
+STEPS = 4  # number of concentration steps from each subset
 MAX_SCORED = 2000  # number of pairs above which the search uses a random sample; all pairs are then tested
 REJECTION_PROBABILITY = 1e-4  # probability that a good pair with Gaussian noise is rejected
 RULE: ScaleRule = "inverse"
@@ -63,8 +63,9 @@ class Similarity:
 
 def _centred(points: F64) -> tuple[F64, F64]:
     """Return the centred points and their mean, in two passes for the precision of points far from the origin."""
-    mean = points.mean(axis=-2, keepdims=True)
-    mean = mean + (points - mean).mean(axis=-2, keepdims=True)
+    mean = np.zeros((*points.shape[:-2], 1, 3))
+    for _ in range(2):
+        mean = mean + (points - mean).mean(axis=-2, keepdims=True)
     return points - mean, mean[..., 0, :]
 
 
@@ -83,8 +84,8 @@ def fit_batch(sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> Similarity:
     sensor, sensor_mean = _centred(sensor_m)
     stack, stack_mean = _centred(stack_m)
     left, values, right = np.linalg.svd(np.swapaxes(sensor, -1, -2) @ stack)
-    sign = np.sign(np.linalg.det(left @ right))
-    right[..., 2, :] *= sign[..., None]
+    sign = np.sign(np.linalg.det(left) * np.linalg.det(right))
+    right = np.concatenate([right[..., :2, :], right[..., 2:, :] * sign[..., None, None]], axis=-2)
     rotation = np.swapaxes(left @ right, -1, -2)
     with np.errstate(divide="ignore", invalid="ignore"):
         scale = _scale(
@@ -100,7 +101,7 @@ def fit_batch(sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> Similarity:
 def extents(points_m: F64) -> F64:
     """Return the RMS extents (3,) of points (K, 3) along their principal axes, in metres, largest first."""
     centred, _ = _centred(points_m)
-    size = float(np.abs(centred).max())
+    size = float(np.abs(centred).max(initial=0.0))
     if size == 0.0:
         return np.zeros(3)
     values = np.linalg.svd(centred / size, compute_uv=False) * size / np.sqrt(len(points_m))
@@ -137,12 +138,12 @@ def fit(sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> Similarity:
 
 def _refuse_degenerate(name: str, points_m: F64) -> None:
     first, second, _ = extents(points_m)
-    rounding_m = 4 * EPSILON * float(np.abs(points_m).max())
-    if first <= rounding_m:
+    magnitude = float(np.abs(points_m).max(initial=0.0))
+    if first <= 4 * EPSILON * magnitude:
         raise Degenerate(f"the {name} points coincide; use viewpoints that are farther apart")
-    if second <= rounding_m:
+    if second <= 4 * EPSILON * magnitude:
         raise Degenerate(f"the {name} points all lie on one line, so the rotation about that line is unknown")
-    bound = rounding_m / second  # verified with 50-digit arithmetic: `phasestack stability`
+    bound = 4 * EPSILON * magnitude / second  # verified with 50-digit arithmetic: `phasestack stability`
     if bound > ROTATION_BOUND_RAD:
         raise Degenerate(
             f"the {name} points are too close to one line or too far from the origin for double precision: "
@@ -178,10 +179,11 @@ class RobustFit:
     inlier: NDArray[np.bool_]  # (K,) True for pairs that agree, False for rejected pairs
 
 
-def _squared(candidate: Similarity, sensor_m: F64, stack_m: F64) -> F64:
-    """Return the squared errors (..., K) of pairs (K, 3), in m², frame `stack`."""
-    squared: F64 = ((candidate.points(sensor_m) - stack_m) ** 2).sum(-1)
-    return squared
+def _residuals(candidate: Similarity, sensor_m: F64, stack_m: F64) -> F64:
+    """Return squared errors (..., K) in m² over the squared scale, which would otherwise favour small scales."""
+    squared = ((candidate.points(sensor_m) - stack_m) ** 2).sum(-1)
+    residuals: F64 = squared / np.maximum(candidate.scale[..., None], 1e-300) ** 2
+    return residuals
 
 
 def _best_half(sensor_m: F64, stack_m: F64, *, random: np.random.Generator) -> NDArray[np.intp]:
@@ -189,12 +191,11 @@ def _best_half(sensor_m: F64, stack_m: F64, *, random: np.random.Generator) -> N
     is then repeated on the half of the pairs that it fits best.
     """
     count = len(sensor_m)
-    keep = min(count, (count + 5) // 2)
-    chosen = np.argsort(random.random((STARTS, count)), axis=1)[:, :START_PAIRS]
-    for _ in range(FITS):
+    keep = min(count, max(3, (count + 5) // 2))
+    chosen = np.argsort(random.random((STARTS, count)), axis=1)[:, : min(START_PAIRS, count)]
+    for _ in range(1 + STEPS):
         candidates = fit_batch(sensor_m[chosen], stack_m[chosen], rule=RULE)
-        with np.errstate(invalid="ignore"):  # points of a sensor that stood still have an infinite scale
-            squared = np.nan_to_num(_squared(candidates, sensor_m, stack_m), nan=np.inf)
+        squared = np.nan_to_num(_residuals(candidates, sensor_m, stack_m), nan=np.inf)
         chosen = np.argpartition(squared, keep - 1, axis=-1)[:, :keep]
     sums = np.take_along_axis(squared, chosen, axis=-1).sum(-1)
     winner = int(np.argmin(sums))
@@ -209,25 +210,34 @@ def fit_robust(sensor_m: F64, stack_m: F64) -> RobustFit:
     """
     count = len(sensor_m)
     everything = fit(sensor_m, stack_m, rule=RULE)
-    least_m = MIN_NOISE * extents(stack_m)[0]
+    spread = float(np.sqrt(((stack_m - stack_m.mean(0)) ** 2).sum(-1).mean()))
     random = np.random.default_rng(0)
-    scored = random.permutation(count)[:MAX_SCORED]
-    half = scored[_best_half(sensor_m[scored], stack_m[scored], random=random)]
+    scored = random.permutation(count)[:MAX_SCORED] if count > MAX_SCORED else np.arange(count)
+    # The points are centred for precision, because the batched fits are only as precise as the cross-covariance.
+    half = scored[_best_half(sensor_m[scored] - sensor_m.mean(0), stack_m[scored] - stack_m.mean(0), random=random)]
     limit = float(chi2.ppf(1 - REJECTION_PROBABILITY, 3))
     inlier = np.zeros(count, bool)
     inlier[half] = True
     current = fit(sensor_m[inlier], stack_m[inlier], rule=RULE)
-    squared = _squared(current, sensor_m, stack_m)
+    squared = ((current.points(sensor_m) - stack_m) ** 2).sum(-1)
     # Estimate the noise from a quantile of chi² with three degrees of freedom, and correct the bias of small samples.
-    noise_m = np.sqrt(squared[half].max() / chi2.ppf(0.999 * len(half) / len(scored), 3))
-    noise_m *= 1 + 5 / (len(scored) - 2)
+    share = len(half) / len(scored)
+    noise_m = np.sqrt(np.partition(squared[scored], len(half) - 1)[len(half) - 1] / chi2.ppf(0.999 * share, 3))
+    noise_m *= 1 + 5 / max(len(scored) - 3, 1)
     for _ in range(20):
-        kept = squared <= limit * max(noise_m, least_m) ** 2
+        kept = squared <= limit * max(noise_m, MIN_NOISE * spread) ** 2
+        if kept.sum() < 3:
+            break
         current = fit(sensor_m[kept], stack_m[kept], rule=RULE)
-        squared = _squared(current, sensor_m, stack_m)
-        # A fit has seven degrees of freedom.
-        noise_m = max(np.sqrt(squared[kept].sum() / (3 * np.count_nonzero(kept) - 7)), noise_m * 0.5)
+        squared = ((current.points(sensor_m) - stack_m) ** 2).sum(-1)
+        noise_m = max(_noise(current, sensor_m, stack_m, kept), noise_m * 0.5)
         if np.array_equal(kept, inlier):
             break
         inlier = kept
     return RobustFit(everything if inlier.all() else current, inlier)
+
+
+def _noise(similarity: Similarity, sensor_m: F64, stack_m: F64, inlier: NDArray[np.bool_]) -> float:
+    """Return the inliers' deviation per coordinate in `stack`, with seven degrees of freedom less for the fit."""
+    squared = ((similarity.points(sensor_m) - stack_m) ** 2).sum(-1)[inlier].sum()
+    return float(np.sqrt(squared / max(3 * int(inlier.sum()) - 7, 1)))

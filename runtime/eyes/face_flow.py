@@ -31,16 +31,17 @@ POINTS_MIN, INLIERS_MIN = 10, 8  # minimum number of tracked points, and of inli
 class FaceFlow:
     """Optical flow that measures how a face has moved between a remembered picture and a new one."""
 
-    _grey: Any  # crop of the remembered picture
-    _crop_from_picture: F64  # (2, 3) from the remembered and the new picture to their crops
-    _mesh: F64  # (n, 2) rigid points in the remembered picture
+    def __init__(self) -> None:
+        self._grey: Any = None
+        self._crop_from_picture = np.eye(2, 3)
+        self._mesh = np.zeros((0, 2))
 
     def remember(self, picture: U8, mesh: F64, eye_distance: float) -> None:
         """Remember the face in a picture, by its mesh (468, 3) and eye separation in pixels."""
         scale = EYE_DISTANCE / eye_distance
         offset = SIZE / 2 - scale * mesh[BRIDGE, :2]
         self._crop_from_picture = np.array([[scale, 0, offset[0]], [0, scale, offset[1]]])
-        self._grey, self._mesh = self._crop(picture), mesh[RIGID, :2]
+        self._grey, self._mesh = self._crop(picture), mesh[RIGID, :2].copy()
 
     def moved(self, picture: U8, mesh: F64) -> F64 | None:
         """Return the (2, 3) similarity from the remembered picture's pixels to a new one's, with its mesh

@@ -48,6 +48,7 @@ class NoiseWatch:
 
 def _weights(times_ns: list[int]) -> F64:
     """Return the weights of samples in their divided difference, scaled to preserve the noise of a single sample."""
-    apart = np.subtract.outer(times_ns, times_ns) + np.eye(len(times_ns))
-    weights = np.reciprocal(apart.prod(axis=1))
+    times = (np.array(times_ns) - times_ns[0]) / (times_ns[-1] - times_ns[0])
+    apart = times[:, None] - times + np.eye(len(times))
+    weights = 1.0 / apart.prod(axis=1)
     return np.asarray(weights / np.linalg.norm(weights), np.float64)

@@ -93,7 +93,7 @@ class RestWatch:
         noise_m = float(self.noise_m.max())
         median_sigma_m = MEDIAN_EFFICIENCY * noise_m / len(recent) ** 0.5
         # `_drifted` does not detect a drift up to this value.
-        drift_m = self._max_drift_m + 2 * MEDIAN_EFFICIENCY * noise_m * (4 / len(recent)) ** 0.5
+        drift_m = self._max_drift_m + 2 * MEDIAN_EFFICIENCY * noise_m * (4 / max(len(recent), FEWEST)) ** 0.5
         self.sigma_m = float(np.hypot(median_sigma_m, drift_m / 2**0.5))  # drift mostly goes in one direction
 
     def _measure_noise(self) -> None:
@@ -116,6 +116,9 @@ class RestWatch:
         shifts = _shifts(recent, recent[-1])
         apart_m = np.abs(_median(shifts[half:]) - _median(shifts[:half]))
         tolerance = HALVES * MEDIAN_EFFICIENCY * (2 / half) ** 0.5
+        # Most motion exceeds the limit for any accepted noise, and measuring the noise takes longer than this check.
+        if apart_m.max() > tolerance * NOISE_MAX_M + GRACE_M:
+            return False
         self._measure_noise()
         if self.noise_m.max() > NOISE_MAX_M or (apart_m > tolerance * self.noise_m + GRACE_M).any():
             return False
