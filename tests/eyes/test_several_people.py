@@ -50,5 +50,4 @@ def test_a_finder_of_one_ignores_the_others() -> None:
     finder = EyeFinder()
     (alone,) = finder.find_all(sample, is_still=True)
     finder.forget()
-    one = finder.find(sample)
-    assert one is not None and np.array_equal(alone.eyes_m, one.eyes_m)
+    assert (one := finder.find(sample)) is not None and np.array_equal(alone.eyes_m, one.eyes_m)
