@@ -120,8 +120,7 @@ def test_without_depth_the_distance_is_as_good_as_eye_separations_are_alike() ->
         eyes = [finder.find(frame(colour, None, CAMERA, number=number)) for finder in (learnt, known)]
     sigmas = [np.sqrt(found.covariance_m2[2, 2]) for found in eyes]
     errors = [abs(found.eyes_m[:, 2].mean() - PLACE[2]) for found in eyes]
-    assert errors[0] < 2.5 * sigmas[0] and 0.01 < sigmas[0] < 0.05
-    assert errors[1] < 2.5 * sigmas[1] and sigmas[1] < 0.02
+    assert np.less(errors, 2.5 * np.array(sigmas)).all() and 0.01 < sigmas[0] < 0.05 and sigmas[1] < 0.02
     seen = eyes[0].eyes_m / eyes[0].eyes_m[:, 2:]
     np.testing.assert_allclose(seen, truth / truth[:, 2:], atol=0.003)  # no sideways error
 

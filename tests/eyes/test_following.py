@@ -74,10 +74,10 @@ class Networks:
 
     def __init__(self) -> None:
         self.faces: Sequence[Face] = ()
+        self.meshes = 0  # how often the mesh was asked for
 
     def near(self, centre: F64) -> Face:
-        faces = self.faces or [Face(presence=0.0)]
-        return min(faces, key=lambda face: float(np.hypot(face.x - centre[0], face.y - centre[1])))
+        return min(self.faces or [Face(presence=0.0)], key=lambda face: np.hypot(*(face.placed([0, 0]) - centre)))
 
     def find(self, picture: U8, *, longest_px: int, score_min: float) -> list[FoundFace]:
         found = []
@@ -90,6 +90,7 @@ class Networks:
 
     def points(self, picture: U8, square: Square, *, is_left: bool | None = None) -> tuple[Any, Any]:
         face = self.near(square.centre)
+        self.meshes += is_left is None
         if is_left is None:
             return face.mesh(), face.presence
         side = 0 if is_left else 1
@@ -174,6 +175,9 @@ def test_averaged_pupils_move_with_the_face(film: Film) -> None:
         found = film.see(face)
         assert found is not None and found.seen == "followed" and found.sigma_px < 0.6
         np.testing.assert_allclose(found.eyes_px, face.placed([(0.5, -0.0093), (-0.5, -0.0093)]), atol=0.2)
+    before = film.networks.meshes
+    for x, count in ((346.9, 1), (368.0, 3)):  # far from where it was, by more than 21 pixels, it is measured twice
+        assert film.see(Face(x=x, y=237.0)) is not None and film.networks.meshes - before == count
 
 
 @pytest.mark.parametrize(
