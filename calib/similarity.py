@@ -195,7 +195,8 @@ def _best_half(sensor_m: F64, stack_m: F64, *, random: np.random.Generator) -> N
     chosen = np.argsort(random.random((STARTS, count)), axis=1)[:, : min(START_PAIRS, count)]
     for _ in range(1 + STEPS):
         candidates = fit_batch(sensor_m[chosen], stack_m[chosen], rule=RULE)
-        squared = np.nan_to_num(_residuals(candidates, sensor_m, stack_m), nan=np.inf)
+        with np.errstate(invalid="ignore"):  # pairs from a sensor that stood still have an infinite scale
+            squared = np.nan_to_num(_residuals(candidates, sensor_m, stack_m), nan=np.inf)
         chosen = np.argpartition(squared, keep - 1, axis=-1)[:, :keep]
     sums = np.take_along_axis(squared, chosen, axis=-1).sum(-1)
     winner = int(np.argmin(sums))
