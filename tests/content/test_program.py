@@ -160,8 +160,9 @@ def test_the_newest_state_is_told_last_and_a_lost_one_again() -> None:
 
     class Slow(Channel):
         def send(self, message: Any, *, timeout_s: float = 0.0) -> bool:
-            sending.set()
-            time.sleep(0.3 if message.frame_ms is None else 0)
+            if message.frame_ms is None:
+                sending.set()
+                eventually(lambda: 5.0 in sent, within_s=0.3)  # if another state can be sent meanwhile
             sent.append(message.frame_ms)
             return sent.count(5.0) != 1  # lost, because too many are unread
 
@@ -173,11 +174,11 @@ def test_the_newest_state_is_told_last_and_a_lost_one_again() -> None:
     serving = Serving(channel, "token")
     telling = threading.Thread(target=serving._tell, args=(0, server))
     telling.start()
-    sending.wait()
+    assert sending.wait(60)
     server.frame_ms = 5.0
     for _ in range(3):
         serving._tell(0, server)
-    telling.join()
+    telling.join(60)
     assert sent == [None, 5.0, 5.0]
     channel.close()
     theirs.close()

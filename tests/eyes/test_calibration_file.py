@@ -42,13 +42,15 @@ def test_the_demo_camera_is_tilted_down_by_ten_degrees() -> None:
 
 def test_eyes_keep_their_confidence_and_their_separation() -> None:
     eyes = EyePoints(np.array([[0.03, -0.05, 0.6], [-0.03, -0.05, 0.6]]), np.array([0.9, 0.4]), completed="right")
-    assert load_calibration(None).apply(eyes).covariance_m2 is None
-    moved = load_calibration(None).apply(replace(eyes, covariance_m2=np.diag([1e-6, 4e-6, 9e-6])))
-    assert moved.completed == "right" and moved.covariance_m2 is not None
-    np.testing.assert_allclose(DEMO_TURN.T @ moved.covariance_m2 @ DEMO_TURN, np.diag([1e-6, 4e-6, 9e-6]), atol=1e-18)
-    np.testing.assert_array_equal(moved.confidence, eyes.confidence)
-    assert np.linalg.norm(moved.eyes_m[0] - moved.eyes_m[1]) == pytest.approx(0.06)
-    assert moved.eyes_m[0][1] < moved.eyes_m[1][1], "the left eye is on the viewer's left"
+    covariance = np.diag([1e-6, 4e-6, 9e-6])
+    moved = [load_calibration(None).apply(one) for one in (eyes, replace(eyes, covariance_m2=covariance))]
+    assert moved[0].covariance_m2 is None and moved[1].covariance_m2 is not None
+    np.testing.assert_allclose(DEMO_TURN.T @ moved[1].covariance_m2 @ DEMO_TURN, covariance, atol=1e-18)
+    for one in moved:
+        assert one.completed == "right"
+        np.testing.assert_array_equal(one.confidence, eyes.confidence)
+        assert np.linalg.norm(one.eyes_m[0] - one.eyes_m[1]) == pytest.approx(0.06)
+        assert one.eyes_m[0][1] < one.eyes_m[1][1], "the left eye is on the viewer's left"
 
 
 def test_a_file_tells_all_that_it_holds(tmp_path: Path) -> None:

@@ -30,6 +30,9 @@ def test_eyes_are_found_in_space_to_some_millimetres_at_every_place(depth_size: 
         assert found.covariance_m2 is not None and finder.pupils is not None
         sigmas_px = np.sqrt(found.covariance_m2.diagonal()[:2]) / place[2] * CAMERA.fx_px / finder.pupils.sigma_px
         np.testing.assert_allclose(sigmas_px, [0.55, 1.1], rtol=0.02 if place[:2] == (0.0, 0.0) else 0.8)
+    colour, depth, (truth,) = scene(PLACE, intrinsics=CAMERA, depth_size=depth_size)
+    first = EyeFinder().find(frame(colour, depth, CAMERA))
+    assert np.abs(first.eyes_m - truth).max() < (0.005 if depth_size else 0.012)
 
 
 def faulty(depth: np.ndarray, seed: int, *, holes: float, flying: float, noise_mm: float) -> np.ndarray:

@@ -115,14 +115,18 @@ A, B, FAR, NEAR = head(0.6, -0.2, 0.0), head(0.8, 0.3, 0.0), head(0.8, -0.2, 0.0
 THREE = head(0.6, -0.3, 0.0), head(0.7, 0.0, 0.0), head(0.8, 0.3, 0.0)
 
 
-@pytest.mark.parametrize(("most_served", "stages"), [
-    (1, [((FAR,), [1]), ((NEAR, FAR), [1]), ((NEAR,), [2])]), (2, [((A, B), [1, 2]), ((B,), [2])]),
-    (2, [(THREE, [1, 2]), (THREE[::2], [1, 3])]), (2, [((A, head(1.2, 0.0, 0.0), head(0.9, 0.6, 0.0)), [1, 3])]),
+@pytest.mark.parametrize(("most_served", "join_s", "stages"), [
+    (1, 1.0, [((FAR,), 1.0, [1]), ((NEAR, FAR), 2.0, [1]), ((NEAR,), 1.0, [2])]),
+    (2, 0.2, [((A, B), 1.0, [1, 2]), ((B,), 1.0, [2])]), (2, 0.2, [(THREE, 2.0, [1, 2]), (THREE[::2], 1.0, [1, 3])]),
+    (2, 0.5, [((A, head(1.2, 0.0, 0.0), head(0.9, 0.6, 0.0)), 0.8, [1, 3])]),
 ])  # fmt: skip
-def test_the_nearest_are_served_and_keep_the_place_until_they_have_left(most_served: int, stages: list[Any]) -> None:
-    crowd = people(most_served=most_served, join_s=0.2)
-    for number, (heads, served) in enumerate(stages):
-        assert fed(crowd, *heads, seconds=1.0, begin_s=1.0 * number)[-1] == served and crowd.in_view == len(heads)
+def test_the_nearest_are_served_and_keep_the_place_until_they_have_left(
+    most_served: int, join_s: float, stages: list[Any]
+) -> None:
+    crowd, begin_s = people(most_served=most_served, join_s=join_s), 0.0
+    for heads, seconds, served in stages:
+        assert fed(crowd, *heads, seconds=seconds, begin_s=begin_s)[-1] == served and crowd.in_view == len(heads)
+        begin_s += seconds
 
 
 def test_one_mistaken_head_serves_nobody_else() -> None:

@@ -96,7 +96,7 @@ def test_another_person_who_passes_in_front_is_not_the_viewer() -> None:
 
 
 def test_another_viewer_is_taken_once_the_first_is_gone_long_enough() -> None:
-    finder = PupilFinder(lock_ns=300_000_000)
+    finder = PupilFinder(lock_ns=9 * PERIOD_NS)  # not yet over when unseen for as long
     here = np.array([0.0, 0.0, 0.7])
     for number in range(14):
         who = grace() if number < 2 else eileen()

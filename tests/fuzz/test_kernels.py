@@ -187,7 +187,7 @@ def drawing_of(seed: int) -> dict[str, Any]:
 
 @pytest.mark.parametrize("first", range(FIRST, FIRST + 10 * EXAMPLES, 10 * BATCH))
 def test_any_picture_is_drawn_within_its_screen_or_refused(first: int) -> None:
-    """By any number of threads alike, whatever its maps, homography and relief."""
+    """Threads draw alike, however many, whatever the maps, homography and relief."""
     loops, done = kernels.library(), 0
     for seed in range(first, first + 10 * BATCH):
         how = drawing_of(seed)

@@ -339,19 +339,21 @@ def test_too_little_memory_is_an_exception() -> None:
 
 
 def test_too_little_memory_to_draw_is_an_exception() -> None:
-    """On any number of threads, which could not raise it."""
+    """Memory is allocated before threads start, which could not raise it."""
     wide = picture(np.zeros((9, 9, 4), np.uint8), np.zeros((1, 1 << 16, 4), np.uint8))
     child = os.fork()
     if child == 0:
-        used = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
-        resource.setrlimit(resource.RLIMIT_AS, (used, -1))
-        held: list[bytearray] = []
-        with suppress(MemoryError):
-            while True:
-                held.append(bytearray(1 << 17))
         try:
-            kernels.library().draw_panels([wide], 2)  # needs 256 kB at once
-        except MemoryError:
-            os._exit(0)
-        os._exit(1)
+            used = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+            resource.setrlimit(resource.RLIMIT_AS, (used, -1))
+            held: list[bytearray] = []
+            with suppress(MemoryError):
+                while True:
+                    held.append(bytearray(1 << 17))
+            try:
+                kernels.library().draw_panels([wide], 2)  # needs 256 kB at once
+            except MemoryError:
+                os._exit(0)
+        finally:
+            os._exit(1)
     assert os.waitpid(child, 0)[1] == 0

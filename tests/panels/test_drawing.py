@@ -34,11 +34,22 @@ PANELS = tuple(PanelSettings(connector=f"DUMMY{n}") for n in range(3))
 MEMORY = Path("/proc/sysvipc/shm")  # a line for each segment of shared memory
 
 
+def ours() -> list[tuple[str, int]]:
+    """Permissions and sizes of the segments that this process has made."""
+    rows = [row.split() for row in MEMORY.read_text().splitlines()]
+    return [(mode[-3:], int(size)) for _, _, mode, size, maker, *_ in rows if maker == str(os.getpid())]
+
+
 def segments() -> list[str]:
     """Permissions of this process's memory shared for pictures of 320x180."""
-    ours = str(128 + 4 * WIDTH_PX * HEIGHT_PX), str(os.getpid())
-    rows = [row.split() for row in MEMORY.read_text().splitlines()]
-    return [mode[-3:] for _, _, mode, size, maker, *_ in rows if (size, maker) == ours]
+    return [mode for mode, size in ours() if size == 128 + 4 * WIDTH_PX * HEIGHT_PX]
+
+
+def class_of(x: XServer, window: Any) -> list[bytes | None]:
+    """Name and class of a GLFW window, as a window manager reads them."""
+    names = (ctypes.c_char_p * 2)()
+    x.do_to_window("XGetClassHint", glfw.get_x11_window(window), names)
+    return list(names)
 
 
 def objects(*kinds: str) -> list[tuple[str, int]]:
@@ -59,7 +70,7 @@ def used_bytes() -> int:
 def test_only_changed_or_exposed_pictures_are_copied_and_lit_when_copied(
     x: XServer, opened: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Simulated, copying takes 100 ns a picture, at first 500."""
+    """Copying takes 100 ns a picture in simulated time, at first 500."""
     clock, done, numbers = SimulatedClock(), list[Any](), dict[SharedPicture, int]()
     put, finish, flush = SharedPicture.put, drawing.finish, drawing.flush
 
@@ -152,25 +163,27 @@ def test_opengl_waits_for_the_first_blank_and_leaves_no_objects(
     display.close_windows()
     display.root.make_current()
     assert objects("Texture", "Program", "Shader", "Buffer", "Framebuffer") == []
-    for _ in range(2):  # at first, libraries are prepared
+    kept = []
+    for _ in range(4):  # at first, libraries are prepared, and other threads allocate now and then
         before = used_bytes()
         for _ in range(10):
             display.fullscreen_window(display.monitors()[0], title="")
             display.close_windows()
-    assert used_bytes() - before < 150_000  # the driver keeps 80 kB, and contexts kept by moderngl would be 130 kB
+        kept.append(used_bytes() - before)
+    assert min(kept) < 150_000  # the driver keeps 80 kB, and contexts kept by moderngl would be 130 kB
 
 
 def test_windows_are_ours_stay_without_focus_and_hide_the_pointer(
     x: XServer, opened: Callable[..., Any], drawn_by: str
 ) -> None:
     sink = opened(*PANELS)
-    display, root, names = sink._display, sink._display.root.handle, (ctypes.c_char_p * 2)()
+    display, root = sink._display, sink._display.root.handle
+    assert class_of(x, root) == [b"phasestack"] * 2
     assert not glfw.get_window_attrib(root, glfw.VISIBLE)
     for handle in sink.window_handles:
         number = glfw.get_x11_window(handle)
         x.do_to_window("XSetInputFocus", number, 0, 0)
-        x.do_to_window("XGetClassHint", number, names)
-        assert list(names) == [b"phasestack"] * 2
+        assert class_of(x, handle) == [b"phasestack"] * 2
         assert eventually(lambda handle=handle: display.poll() == "" and glfw.get_window_attrib(handle, glfw.FOCUSED))
         assert glfw.get_window_attrib(handle, glfw.CLIENT_API) == {"opengl": 0x30001, "processor": 0}[drawn_by]
         assert glfw.get_input_mode(handle, glfw.CURSOR) == glfw.CURSOR_HIDDEN
@@ -195,13 +208,15 @@ def test_pictures_and_questions_take_no_memory_for_good(x: XServer, opened: Call
     x.set_edid(0, block(serial_text="ONE"))
     sink = opened(*PANELS)
     place = x_display(), glfw.get_x11_window(sink.window_handles[0])
-    for _ in range(2):  # at first, libraries are prepared
+    kept = []
+    for _ in range(4):  # at first, libraries are prepared, and other threads allocate now and then
         before = used_bytes()
         for _ in range(300):
             assert sink._display.output_state("DUMMY0")
             SharedPicture(*place, width_px=WIDTH_PX, height_px=HEIGHT_PX).close()
-    assert used_bytes() - before < 9000
-    listed, refusals, limits = len(MEMORY.read_text()), xlib.refusals(), resource.getrlimit(resource.RLIMIT_AS)
+        kept.append(used_bytes() - before)
+    assert min(kept) < 9000
+    listed, refusals, limits = ours(), xlib.refusals(), resource.getrlimit(resource.RLIMIT_AS)
     in_use = 4096 * int(Path("/proc/self/statm").read_text().split()[0])
     resource.setrlimit(resource.RLIMIT_AS, (in_use + (1 << 29), limits[1]))
     try:
@@ -209,4 +224,4 @@ def test_pictures_and_questions_take_no_memory_for_good(x: XServer, opened: Call
             SharedPicture(*place, width_px=20000, height_px=20000)
     finally:
         resource.setrlimit(resource.RLIMIT_AS, limits)
-    assert len(MEMORY.read_text()) == listed and xlib.refusals() == refusals
+    assert ours() == listed and xlib.refusals() == refusals

@@ -146,12 +146,14 @@ def found_in(state: str, folder: Path) -> list[str]:
 @pytest.mark.windows
 def test_the_doctor_finds_a_gamma_set_by_the_x_server(x: XServer, tmp_path: Path) -> None:
     dimmed = ("1:1:1", "1", 0), ("1:0.8:0.6", "1", 1), ("1:1:1", "0.994", 1), ("1:1:1", "0.997", 0)  # by 1/255: none
-    for gamma, brightness, count in dimmed:
-        x.xrandr("--output", "DUMMY1", "--gamma", gamma, "--brightness", brightness)
-        warned = found_in("warn", tmp_path)
-        assert len(warned) == count
-        assert all("grey levels of DUMMY1 (gamma, brightness or a night light)" in told for told in warned)
-    x.xrandr("--output", "DUMMY1", "--gamma", "1:1:1", "--brightness", "1")
+    try:
+        for gamma, brightness, count in (*dimmed, ("1:1:1", "1", 0)):
+            x.xrandr("--output", "DUMMY1", "--gamma", gamma, "--brightness", brightness)
+            warned = found_in("warn", tmp_path)
+            assert len(warned) == count
+            assert all("grey levels of DUMMY1 (gamma, brightness or a night light)" in told for told in warned)
+    finally:
+        x.xrandr("--output", "DUMMY1", "--gamma", "1:1:1", "--brightness", "1")
 
 
 @pytest.mark.windows

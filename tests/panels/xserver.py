@@ -153,7 +153,7 @@ class XServer:
         return [screen[:, WIDTH_PX * index : WIDTH_PX * (index + 1)] for index in range(3)]
 
     def panel(self, index: int) -> npt.NDArray[np.uint8]:
-        """What monitor `index` shows."""
+        """Screenshot of monitor `index`."""
         return self.panels()[index]
 
     def set_edid(self, index: int, data: bytes) -> None:
